@@ -1,0 +1,40 @@
+# `make train` and `make test` need nothing but Python 3.10+ and make.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+ALGO ?= sac_flow
+ENV ?= TunnelDiagonal-v0
+SEED ?= 1
+LOGS ?= logs
+
+.DEFAULT_GOAL := help
+.PHONY: help train test lint types check clean
+
+help:  ## Show this help
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+
+# The stamp is remade only when the requirements change, so repeated calls start at once.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[all,dev]"
+	touch $@
+
+train: $(VENV)/.installed  ## Train ALGO on ENV with SEED, print the success rate, draw the policy
+	$(BIN)/python -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) \
+		--log-folder $(LOGS) --tensorboard-log $(LOGS)/tensorboard --progress
+	$(BIN)/python -m sb3_flowpolicy.diagnostics --algo $(ALGO) --env $(ENV) --folder $(LOGS)
+
+test: $(VENV)/.installed  ## Run the tests
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+
+lint: $(VENV)/.installed  ## Check style
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed  ## Check types
+	$(BIN)/mypy
+
+check: lint types test  ## Everything that has to pass before a commit lands
+
+clean:  ## Remove the virtual environment and caches
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache

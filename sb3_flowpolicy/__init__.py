@@ -1,0 +1,1 @@
+"""Soft Actor-Critic policies that correlate and bend their action distribution."""
