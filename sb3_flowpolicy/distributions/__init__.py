@@ -1,0 +1,25 @@
+"""Action densities: pure functions of (parameters, context, noise). Imports torch only."""
+
+from sb3_flowpolicy.distributions.base import ActionDistribution
+from sb3_flowpolicy.distributions.full_covariance import FullCovarianceGaussian
+from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+from sb3_flowpolicy.distributions.low_rank import LowRankGaussian
+from sb3_flowpolicy.distributions.realnvp import RealNVP
+from sb3_flowpolicy.distributions.registry import (
+    make_distribution,
+    register_distribution,
+    registered_distributions,
+)
+from sb3_flowpolicy.distributions.squashed import TanhSquashed
+
+__all__ = [
+    "ActionDistribution",
+    "DiagGaussian",
+    "FullCovarianceGaussian",
+    "LowRankGaussian",
+    "RealNVP",
+    "TanhSquashed",
+    "make_distribution",
+    "register_distribution",
+    "registered_distributions",
+]

@@ -1,0 +1,130 @@
+r"""What every action density has to be: a pure function of parameters, context and noise."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import torch as th
+from torch import nn
+
+LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+class ActionDistribution(nn.Module, ABC):
+    r"""Conditional density p(u | h) over unsquashed actions u, given a context h.
+
+    Noise is drawn by the caller and handed in, so that the same code runs eagerly, under
+    ``torch.compile``, under ``torch.func.vmap`` and in an exported graph, and so that two
+    implementations can be compared number by number.
+
+    To add a density, subclass this in one file, set :attr:`noise_dim`, write
+    :meth:`_rsample_and_log_prob`, :meth:`_log_prob` and :meth:`_mode`, and call
+    :func:`~sb3_flowpolicy.distributions.register_distribution`. Shapes are checked here, once:
+    the subclass is mathematics only. Leading dimensions of context and noise broadcast, so
+    N samples per context cost one evaluation of whatever depends on the context alone.
+
+    Args:
+        action_dim: Number of action dimensions D, at least 1.
+        context_dim: Number of context features H, at least 1.
+
+    Raises:
+        ValueError: If a dimension is not a positive integer.
+    """
+
+    #: Number of standard normals M that one sample consumes.
+    noise_dim: int
+
+    def __init__(self, action_dim: int, context_dim: int) -> None:
+        super().__init__()
+        self.action_dim = positive_int("action_dim", action_dim)
+        self.context_dim = positive_int("context_dim", context_dim)
+        self.noise_dim = self.action_dim
+
+    def rsample_and_log_prob(
+        self, context: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Turn noise into a reparametrised sample and its log-density, in one pass.
+
+        Args:
+            context: Features h, shape (..., H).
+            noise: Standard normal noise, shape (..., M).
+
+        Returns:
+            The sample u, shape (..., D), and log p(u | h) in nats, shape (...).
+
+        Raises:
+            ValueError: If a last dimension does not fit.
+        """
+        _check_last_dim("context", context, self.context_dim)
+        _check_last_dim("noise", noise, self.noise_dim)
+        return self._rsample_and_log_prob(context, noise)
+
+    def log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
+        """Score arbitrary points.
+
+        Args:
+            context: Features h, shape (..., H).
+            value: Points u, shape (..., D).
+
+        Returns:
+            log p(u | h) in nats, shape (...).
+
+        Raises:
+            ValueError: If a last dimension does not fit.
+        """
+        _check_last_dim("context", context, self.context_dim)
+        _check_last_dim("value", value, self.action_dim)
+        return self._log_prob(context, value)
+
+    def mode(self, context: th.Tensor) -> th.Tensor:
+        """Return the deterministic action: the mean, or for a flow the image of the base mean.
+
+        Args:
+            context: Features h, shape (..., H).
+
+        Returns:
+            The unsquashed action, shape (..., D).
+
+        Raises:
+            ValueError: If the last dimension does not fit.
+        """
+        _check_last_dim("context", context, self.context_dim)
+        return self._mode(context)
+
+    @abstractmethod
+    def _rsample_and_log_prob(
+        self, context: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]: ...
+
+    @abstractmethod
+    def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor: ...
+
+    @abstractmethod
+    def _mode(self, context: th.Tensor) -> th.Tensor: ...
+
+
+def standard_normal_log_prob(noise: th.Tensor) -> th.Tensor:
+    """Log-density of a standard normal, summed over the last dimension: (..., M) -> (...)."""
+    return -(0.5 * noise.square() + LOG_SQRT_2PI).sum(-1)
+
+
+def soft_bound(value: th.Tensor, bound: float) -> th.Tensor:
+    r"""Squeeze into (-bound, bound) by :math:`x / (1 + |x| / b)`.
+
+    The slope is 1 at zero and never vanishes, so that, unlike a clip, a value that has run
+    into the bound still receives a gradient that can bring it back.
+    """
+    return value / (1 + value.abs() / bound)
+
+
+def positive_int(name: str, value: int) -> int:
+    """Return ``value`` if it is an integer of at least 1, otherwise raise ``ValueError``."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be an integer >= 1, got {value!r}")
+    return value
+
+
+def _check_last_dim(name: str, tensor: th.Tensor, expected: int) -> None:
+    if tensor.ndim == 0 or tensor.shape[-1] != expected:
+        raise ValueError(f"{name} must have shape (..., {expected}), got {tuple(tensor.shape)}")

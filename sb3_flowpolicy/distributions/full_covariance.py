@@ -1,0 +1,87 @@
+"""Normal distribution with a full covariance matrix, kept stable by how it is written down."""
+
+from __future__ import annotations
+
+import torch as th
+from torch import nn
+
+from sb3_flowpolicy.distributions.base import soft_bound, standard_normal_log_prob
+from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+
+# Two coordinates can correlate up to 10 / sqrt(1 + 10^2) = 0.995.
+OFF_DIAGONAL_BOUND = 10.0
+
+
+class FullCovarianceGaussian(DiagGaussian):
+    r"""Normal distribution with covariance :math:`\Sigma = L L^\top`.
+
+    The thesis tried this with a clipped Cholesky factor and gave it up for numerical trouble:
+    an off-diagonal entry that is large next to its diagonal makes :math:`L^{-1}` explode.
+    Here scale and correlation are separate. T is unit lower triangular with softly bounded
+    entries, its rows are normalised, and the standard deviations multiply the rows:
+
+    .. math:: L_{ij} = \sigma_i T_{ij} / \| T_{i \cdot} \|, \qquad T_{ii} = 1
+
+    so :math:`\sigma` is the marginal standard deviation as in :class:`DiagGaussian`, T alone
+    decides the correlations, and no ratio of scales enters any inverse.
+
+    Args:
+        action_dim: Number of action dimensions D, at least 1.
+        context_dim: Number of context features H, at least 1.
+
+    References:
+        Thesis section 2.2.2, "Covariance Matrix".
+
+    Example:
+        >>> import torch as th
+        >>> _ = th.manual_seed(0)
+        >>> density = FullCovarianceGaussian(action_dim=3, context_dim=4)
+        >>> u, log_prob = density.rsample_and_log_prob(th.zeros(5, 4), th.randn(5, 3))
+        >>> th.allclose(log_prob, density.log_prob(th.zeros(5, 4), u), atol=1e-4)
+        True
+    """
+
+    _entry_index: th.Tensor
+
+    def __init__(self, action_dim: int, context_dim: int) -> None:
+        super().__init__(action_dim, context_dim)
+        n_entries = action_dim * (action_dim - 1) // 2
+        # With one dimension there is nothing to correlate.
+        self.off_diagonal = nn.Linear(context_dim, n_entries) if n_entries else None
+        # Entry (i, j) of T is a lookup in [head output, 0, 1].
+        index = th.full((action_dim, action_dim), n_entries)
+        rows, cols = th.tril_indices(action_dim, action_dim, offset=-1)
+        index[rows, cols] = th.arange(n_entries)
+        index.fill_diagonal_(n_entries + 1)
+        self.register_buffer("_entry_index", index.flatten(), persistent=False)
+
+    def unit_lower(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return T, shape (..., D, D), and the log-norms of its rows, shape (..., D)."""
+        shape = context.shape[:-1]
+        zero_one = context.new_tensor([0.0, 1.0]).expand(*shape, 2)
+        entries = zero_one
+        if self.off_diagonal is not None:
+            bounded = soft_bound(self.off_diagonal(context), OFF_DIAGONAL_BOUND)
+            entries = th.cat([bounded, zero_one], dim=-1)
+        lower = entries.index_select(-1, self._entry_index)
+        lower = lower.unflatten(-1, (self.action_dim, self.action_dim))
+        return lower, 0.5 * lower.square().sum(-1).log()
+
+    def _rsample_and_log_prob(
+        self, context: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        loc, log_std = self.loc_and_log_std(context)
+        lower, log_norm = self.unit_lower(context)
+        log_diag = log_std - log_norm
+        sample = loc + log_diag.exp() * (lower * noise.unsqueeze(-2)).sum(-1)
+        return sample, standard_normal_log_prob(noise) - log_diag.sum(-1)
+
+    def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
+        loc, log_std = self.loc_and_log_std(context)
+        lower, log_norm = self.unit_lower(context)
+        log_diag = log_std - log_norm
+        scaled = (value - loc) * (-log_diag).exp()
+        noise = th.linalg.solve_triangular(
+            lower, scaled.unsqueeze(-1), upper=False, unitriangular=True
+        ).squeeze(-1)
+        return standard_normal_log_prob(noise) - log_diag.sum(-1)

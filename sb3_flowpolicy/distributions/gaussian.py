@@ -1,0 +1,62 @@
+"""Diagonal normal distribution: what stock SAC explores with."""
+
+from __future__ import annotations
+
+import torch as th
+from torch import nn
+
+from sb3_flowpolicy.distributions.base import (
+    ActionDistribution,
+    standard_normal_log_prob,
+)
+
+# SB3's clamp, so that a stock SAC actor and ours are the same function.
+LOG_STD_MIN = -20.0
+LOG_STD_MAX = 2.0
+
+
+class DiagGaussian(ActionDistribution):
+    r"""Normal distribution with diagonal covariance.
+
+    .. math:: u = \mu(h) + \sigma(h) \odot \epsilon, \qquad \epsilon \sim \mathcal N(0, I_D)
+
+    The heads carry the names and the clamp of SB3's SAC actor, so that a stock checkpoint fits.
+
+    Args:
+        action_dim: Number of action dimensions D, at least 1.
+        context_dim: Number of context features H, at least 1.
+
+    References:
+        Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis eq. 2.12.
+
+    Example:
+        >>> import torch as th
+        >>> _ = th.manual_seed(0)
+        >>> density = DiagGaussian(action_dim=2, context_dim=3)
+        >>> u, log_prob = density.rsample_and_log_prob(th.zeros(5, 3), th.randn(5, 2))
+        >>> u.shape, log_prob.shape
+        (torch.Size([5, 2]), torch.Size([5]))
+    """
+
+    def __init__(self, action_dim: int, context_dim: int) -> None:
+        super().__init__(action_dim, context_dim)
+        self.mu = nn.Linear(context_dim, action_dim)
+        self.log_std = nn.Linear(context_dim, action_dim)
+
+    def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the mean and the clamped log standard deviation, both of shape (..., D)."""
+        return self.mu(context), self.log_std(context).clamp(LOG_STD_MIN, LOG_STD_MAX)
+
+    def _rsample_and_log_prob(
+        self, context: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        loc, log_std = self.loc_and_log_std(context)
+        sample = loc + log_std.exp() * noise
+        return sample, standard_normal_log_prob(noise) - log_std.sum(-1)
+
+    def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
+        loc, log_std = self.loc_and_log_std(context)
+        return standard_normal_log_prob((value - loc) * (-log_std).exp()) - log_std.sum(-1)
+
+    def _mode(self, context: th.Tensor) -> th.Tensor:
+        return self.mu(context)

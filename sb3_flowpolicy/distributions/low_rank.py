@@ -1,0 +1,103 @@
+"""Normal distribution whose covariance is a low-rank matrix plus a diagonal."""
+
+from __future__ import annotations
+
+import torch as th
+from torch import nn
+
+from sb3_flowpolicy.distributions.base import LOG_SQRT_2PI, positive_int, soft_bound
+from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+
+# Three units of u reach tanh(3) = 0.995: a single column of V spans the whole action box.
+COV_FACTOR_BOUND = 3.0
+
+
+class LowRankGaussian(DiagGaussian):
+    r"""Normal distribution with covariance :math:`\Sigma = V V^\top + \mathrm{diag}(\sigma^2)`.
+
+    A sample takes M = D + K normals, :math:`u = \mu + V \epsilon_K + \sigma \odot \epsilon_D`.
+    Instead of inverting the K x K capacitance matrix, whose entries grow as
+    :math:`1 / \sigma^2`, the density is read off an orthonormal basis Q R = [V / sigma; I]:
+
+    .. math::
+        \log\det\Sigma = 2 \sum_i \log\sigma_i + 2 \sum_k \log R_{kk}, \qquad
+        (u - \mu)^\top \Sigma^{-1} (u - \mu) = \| n - Q Q^\top n \|^2
+
+    with :math:`n = [\epsilon_D; -\epsilon_K]` for a sample and :math:`n = [(u - \mu) / \sigma; 0]`
+    for a given point. Every :math:`R_{kk} \ge 1` by construction, so nothing can overflow or
+    turn negative, down to :math:`\sigma = e^{-20}`, for any K.
+
+    Args:
+        action_dim: Number of action dimensions D, at least 1.
+        context_dim: Number of context features H, at least 1.
+        rank: Rank K of the factor V, between 1 and D. Default: 2, or 1 where D = 1.
+
+    Raises:
+        ValueError: If ``rank`` is not between 1 and D.
+
+    References:
+        Thesis eq. 2.13, which clips V; here it is softly bounded.
+
+    Example:
+        >>> import torch as th
+        >>> _ = th.manual_seed(0)
+        >>> density = LowRankGaussian(action_dim=8, context_dim=3, rank=2)
+        >>> density.noise_dim
+        10
+        >>> u, log_prob = density.rsample_and_log_prob(th.zeros(5, 3), th.randn(5, 10))
+        >>> th.allclose(log_prob, density.log_prob(th.zeros(5, 3), u), atol=1e-4)
+        True
+    """
+
+    def __init__(self, action_dim: int, context_dim: int, rank: int | None = None) -> None:
+        super().__init__(action_dim, context_dim)
+        self.rank = min(2, action_dim) if rank is None else positive_int("rank", rank)
+        if self.rank > action_dim:
+            raise ValueError(f"rank must be at most action_dim = {action_dim}, got {rank}")
+        self.noise_dim = action_dim + self.rank
+        self.cov_factor = nn.Linear(context_dim, action_dim * self.rank)
+
+    def covariance_factors(
+        self, context: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, tuple[th.Tensor, ...]]:
+        """Return mean (..., D), log sigma (..., D) and the K columns of V, each (..., D)."""
+        loc, log_std = self.loc_and_log_std(context)
+        columns = soft_bound(self.cov_factor(context), COV_FACTOR_BOUND)
+        return loc, log_std, columns.chunk(self.rank, dim=-1)
+
+    def _rsample_and_log_prob(
+        self, context: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        loc, log_std, columns = self.covariance_factors(context)
+        diag_noise, factor_noise = noise.split([self.action_dim, self.rank], dim=-1)
+        sample = loc + log_std.exp() * diag_noise
+        for k, column in enumerate(columns):
+            sample = sample + column * factor_noise[..., k : k + 1]
+        hidden = th.cat([diag_noise, -factor_noise], dim=-1)
+        return sample, self._density(log_std, columns, hidden)
+
+    def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
+        loc, log_std, columns = self.covariance_factors(context)
+        scaled = (value - loc) * (-log_std).exp()
+        hidden = th.cat([scaled, scaled.new_zeros(*scaled.shape[:-1], self.rank)], dim=-1)
+        return self._density(log_std, columns, hidden)
+
+    def _density(
+        self, log_std: th.Tensor, columns: tuple[th.Tensor, ...], hidden: th.Tensor
+    ) -> th.Tensor:
+        """Project ``hidden`` off the column space of [V / sigma; I] by modified Gram-Schmidt."""
+        inv_std = (-log_std).exp()
+        identity = th.eye(self.rank, dtype=log_std.dtype, device=log_std.device)
+        basis: list[th.Tensor] = []
+        half_log_det = log_std.sum(-1)
+        for column, unit in zip(columns, identity, strict=True):
+            rest = th.cat([column * inv_std, unit.expand(*column.shape[:-1], -1)], dim=-1)
+            for direction in basis:
+                rest = rest - (rest * direction).sum(-1, keepdim=True) * direction
+            norm = rest.norm(dim=-1, keepdim=True)
+            basis.append(rest / norm)
+            half_log_det = half_log_det + norm.squeeze(-1).log()
+        for direction in basis:
+            hidden = hidden - (hidden * direction).sum(-1, keepdim=True) * direction
+        mahalanobis = hidden.square().sum(-1)
+        return -0.5 * mahalanobis - half_log_det - self.action_dim * LOG_SQRT_2PI

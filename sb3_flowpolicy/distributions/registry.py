@@ -1,0 +1,86 @@
+"""Names for densities, so that ``policy_kwargs`` and YAML files can ask for them."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from sb3_flowpolicy.distributions.base import ActionDistribution
+from sb3_flowpolicy.distributions.full_covariance import FullCovarianceGaussian
+from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+from sb3_flowpolicy.distributions.low_rank import LowRankGaussian
+from sb3_flowpolicy.distributions.realnvp import RealNVP
+
+_REGISTRY: dict[str, type[ActionDistribution]] = {
+    "gaussian": DiagGaussian,
+    "low_rank": LowRankGaussian,
+    "full_covariance": FullCovarianceGaussian,
+    "realnvp": RealNVP,
+}
+
+
+def register_distribution(name: str, distribution_class: type[ActionDistribution]) -> None:
+    """Make a density available as ``policy_kwargs=dict(distribution=name)``.
+
+    A saved model refers to the density by name: register it before loading, too.
+
+    Args:
+        name: Name to register, not taken by another class.
+        distribution_class: Subclass of :class:`ActionDistribution` whose constructor takes
+            ``action_dim``, ``context_dim`` and keyword arguments of its own.
+
+    Raises:
+        ValueError: If the name is taken or the class is no ``ActionDistribution``.
+
+    Example:
+        >>> from sb3_flowpolicy.distributions import DiagGaussian
+        >>> class Sharp(DiagGaussian):
+        ...     "A normal distribution, half as wide."
+        ...     def loc_and_log_std(self, context):
+        ...         loc, log_std = super().loc_and_log_std(context)
+        ...         return loc, log_std - 0.7
+        >>> register_distribution("sharp", Sharp)
+        >>> make_distribution("sharp", action_dim=2, context_dim=8).action_dim
+        2
+    """
+    is_class = inspect.isclass(distribution_class)
+    if not is_class or not issubclass(distribution_class, ActionDistribution):
+        raise ValueError(
+            f"distribution_class must be a subclass of ActionDistribution, "
+            f"got {distribution_class!r}"
+        )
+    if _REGISTRY.get(name, distribution_class) is not distribution_class:
+        raise ValueError(f'name "{name}" is taken by {_REGISTRY[name].__name__}')
+    _REGISTRY[name] = distribution_class
+
+
+def registered_distributions() -> dict[str, type[ActionDistribution]]:
+    """Return a copy of the registry: name -> class."""
+    return dict(_REGISTRY)
+
+
+def make_distribution(
+    name: str, action_dim: int, context_dim: int, **distribution_kwargs: Any
+) -> ActionDistribution:
+    """Build a registered density.
+
+    Args:
+        name: A registered name.
+        action_dim: Number of action dimensions D, at least 1.
+        context_dim: Number of context features H, at least 1.
+        **distribution_kwargs: Passed to the density's constructor.
+
+    Returns:
+        The density, not squashed.
+
+    Raises:
+        ValueError: If the name or a keyword argument is unknown.
+    """
+    if name not in _REGISTRY:
+        raise ValueError(f"distribution must be one of {sorted(_REGISTRY)}, got {name!r}")
+    parameters = inspect.signature(_REGISTRY[name]).parameters
+    accepted = [p for p in parameters if p not in ("action_dim", "context_dim")]
+    unknown = sorted(set(distribution_kwargs) - set(accepted))
+    if unknown:
+        raise ValueError(f'distribution_kwargs of "{name}" must be among {accepted}, got {unknown}')
+    return _REGISTRY[name](action_dim, context_dim, **distribution_kwargs)
