@@ -1,1 +1,60 @@
-"""Soft Actor-Critic policies that correlate and bend their action distribution."""
+"""Soft Actor-Critic policies that correlate and bend their action distribution.
+
+Public names are resolved on first use, so that importing the package stays cheap.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
+    from sb3_flowpolicy.policies import (
+        CnnFlowPolicy,
+        CnnGaussPolicy,
+        CnnLowRankPolicy,
+        FlowPolicy,
+        GaussPolicy,
+        LowRankPolicy,
+        MultiInputFlowPolicy,
+        MultiInputGaussPolicy,
+        MultiInputLowRankPolicy,
+    )
+    from sb3_flowpolicy.sac_flow import SACFlow
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ActionDistribution",
+    "CnnFlowPolicy",
+    "CnnGaussPolicy",
+    "CnnLowRankPolicy",
+    "FlowPolicy",
+    "GaussPolicy",
+    "LowRankPolicy",
+    "MultiInputFlowPolicy",
+    "MultiInputGaussPolicy",
+    "MultiInputLowRankPolicy",
+    "SACFlow",
+    "register_distribution",
+]
+
+_ELSEWHERE = {
+    "ActionDistribution": "distributions",
+    "SACFlow": "sac_flow",
+    "register_distribution": "distributions",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module(f"{__name__}.{_ELSEWHERE.get(name, 'policies')}")
+    value = getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

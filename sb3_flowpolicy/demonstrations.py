@@ -1,0 +1,137 @@
+"""Transitions of someone else's making, put into the replay buffer before learning starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+
+KEYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
+
+
+def record_demonstrations(
+    env: gym.Env, controller: Callable[[Any], np.ndarray], n_steps: int, seed: int | None = None
+) -> dict[str, np.ndarray]:
+    """Let a controller act and write down what happens.
+
+    Args:
+        env: Environment with array observations.
+        controller: Function from an observation to an action of the environment.
+        n_steps: Number of transitions N, at least 1.
+        seed: Seed of the first reset.
+
+    Returns:
+        Arrays with N rows under the keys ``observations``, ``actions``, ``rewards``,
+        ``next_observations``, ``terminations`` and ``truncations``: what
+        :meth:`SACFlow.add_demonstrations` takes, and ``np.savez`` writes.
+
+    Raises:
+        ValueError: If ``n_steps`` is not positive.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> import numpy as np
+        >>> demos = record_demonstrations(gym.make("Pendulum-v1"), lambda obs: np.zeros(1), 5)
+        >>> demos["observations"].shape
+        (5, 3)
+    """
+    if n_steps < 1:
+        raise ValueError(f"n_steps must be at least 1, got {n_steps}")
+    columns: dict[str, list] = {key: [] for key in KEYS}
+    obs, _ = env.reset(seed=seed)
+    for _ in range(n_steps):
+        action = np.asarray(controller(obs))
+        next_obs, reward, terminated, truncated, _ = env.step(action)
+        row = (obs, action, reward, next_obs, terminated, truncated)
+        for column, value in zip(columns.values(), row, strict=True):
+            column.append(value)
+        obs = env.reset()[0] if terminated or truncated else next_obs
+    return {key: np.asarray(column) for key, column in columns.items()}
+
+
+def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Read demonstrations and check that they are complete.
+
+    Args:
+        source: Path of an ``.npz`` file, or the arrays themselves.
+
+    Returns:
+        The six arrays, with as many rows each.
+
+    Raises:
+        ValueError: If the file does not exist, an array is missing or empty, or lengths differ.
+    """
+    if isinstance(source, Mapping):
+        arrays = dict(source)
+    else:
+        if not Path(source).is_file():
+            raise ValueError(f"demonstrations must be an .npz file that exists, got {source!s}")
+        with np.load(source, allow_pickle=False) as file:
+            arrays = dict(file)
+    missing = [key for key in KEYS if key not in arrays]
+    if missing:
+        raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")
+    lengths = {key: len(arrays[key]) for key in KEYS}
+    if len(set(lengths.values())) > 1 or not lengths["actions"]:
+        raise ValueError(f"demonstrations must have equally many rows, at least 1, got {lengths}")
+    return {key: np.asarray(arrays[key]) for key in KEYS}
+
+
+def fill_replay_buffer(
+    buffer: ReplayBuffer, policy: BasePolicy, demonstrations: Mapping[str, np.ndarray]
+) -> int:
+    """Append demonstrations to a replay buffer, as if the agent had lived through them.
+
+    With several environments each gets a run of consecutive rows, and up to n_envs - 1 rows at
+    the end are left out.
+
+    Args:
+        buffer: SB3 replay buffer for array observations.
+        policy: Policy whose action space the demonstrations were recorded in.
+        demonstrations: The six arrays of :func:`load_demonstrations`.
+
+    Returns:
+        Number of transitions that were added.
+
+    Raises:
+        ValueError: If the buffer's kind cannot take them, or they do not fit into it.
+    """
+    if isinstance(buffer, HerReplayBuffer | DictReplayBuffer) or buffer.optimize_memory_usage:
+        raise ValueError(
+            "demonstrations need a replay buffer for array observations that stores "
+            f"next observations, got {type(buffer).__name__} with "
+            f"optimize_memory_usage={buffer.optimize_memory_usage}"
+        )
+    per_env = len(demonstrations["actions"]) // buffer.n_envs
+    if not 1 <= per_env <= buffer.buffer_size:
+        raise ValueError(
+            f"demonstrations must have between {buffer.n_envs} and "
+            f"{buffer.n_envs * buffer.buffer_size} rows, got {len(demonstrations['actions'])}"
+        )
+    runs = {
+        key: demonstrations[key][: per_env * buffer.n_envs]
+        .reshape(buffer.n_envs, per_env, *demonstrations[key].shape[1:])
+        .swapaxes(0, 1)
+        for key in KEYS
+    }
+    # The run breaks off at its end: n-step returns must not reach past it.
+    runs["truncations"] = runs["truncations"].copy()
+    runs["truncations"][-1] |= ~runs["terminations"][-1]
+    actions = policy.scale_action(runs["actions"])
+    for t in range(per_env):
+        terminated, truncated = runs["terminations"][t], runs["truncations"][t]
+        buffer.add(
+            runs["observations"][t],
+            runs["next_observations"][t],
+            actions[t],
+            runs["rewards"][t],
+            terminated | truncated,
+            [{"TimeLimit.truncated": bool(flag)} for flag in truncated & ~terminated],
+        )
+    return per_env * buffer.n_envs

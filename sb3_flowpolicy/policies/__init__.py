@@ -1,0 +1,29 @@
+"""Actors and SB3 policy classes: where SB3's words become those of the densities."""
+
+from sb3_flowpolicy.policies.actor import FlowActor
+from sb3_flowpolicy.policies.sac import (
+    CnnFlowPolicy,
+    CnnGaussPolicy,
+    CnnLowRankPolicy,
+    DistributionPolicy,
+    FlowPolicy,
+    GaussPolicy,
+    LowRankPolicy,
+    MultiInputFlowPolicy,
+    MultiInputGaussPolicy,
+    MultiInputLowRankPolicy,
+)
+
+__all__ = [
+    "CnnFlowPolicy",
+    "CnnGaussPolicy",
+    "CnnLowRankPolicy",
+    "DistributionPolicy",
+    "FlowActor",
+    "FlowPolicy",
+    "GaussPolicy",
+    "LowRankPolicy",
+    "MultiInputFlowPolicy",
+    "MultiInputGaussPolicy",
+    "MultiInputLowRankPolicy",
+]

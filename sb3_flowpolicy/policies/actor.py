@@ -1,0 +1,208 @@
+"""The actor: SB3's SAC actor with its normal heads replaced by any registered density."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.sac.policies import Actor
+from torch import nn
+
+from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
+
+# What `density.base.` would prefix in a state dict lives at the actor's own level instead, as
+# SB3's `mu` and `log_std` do: a Gauss actor and a stock SAC actor exchange checkpoints.
+_HEAD_PREFIX = "density.base."
+
+
+class FlowActor(Actor):
+    r"""Policy network whose action distribution is a registered density, squashed by tanh.
+
+    .. math:: a = \tanh(u), \qquad u \sim p(\cdot \mid h), \qquad h = \mathrm{latent\_pi}(s)
+
+    Actions are in SB3's scaled box [-1, 1]^D, flattened to (batch, D) whatever the shape of the
+    action space. Everything that samples accepts the noise to use.
+
+    Args:
+        observation_space: Observation space.
+        action_space: Box with finite bounds.
+        net_arch: Units of the hidden layers that compute h.
+        features_extractor: Network that turns observations into features.
+        features_dim: Number of features.
+        activation_fn: Activation between the hidden layers.
+        normalize_images: Whether to divide images by 255.
+        distribution: Name of a registered density.
+        distribution_kwargs: Arguments of its constructor.
+
+    Raises:
+        ValueError: If the density or one of its arguments is unknown.
+    """
+
+    density: TanhSquashed
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+        distribution: str = "realnvp",
+        distribution_kwargs: Mapping[str, Any] | None = None,
+    ) -> None:
+        # Not Actor.__init__: it would build normal heads to be thrown away, and the random
+        # numbers they draw would keep GaussPolicy from starting with stock SAC's weights.
+        BasePolicy.__init__(
+            self,
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.use_sde = False
+        self.distribution = distribution
+        self.distribution_kwargs = dict(distribution_kwargs or {})
+
+        self.latent_pi = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
+        context_dim = net_arch[-1] if net_arch else features_dim
+        action_dim = get_action_dim(action_space)
+        density = make_distribution(
+            distribution, action_dim, context_dim, **self.distribution_kwargs
+        )
+        clashes = dict(density.named_children()).keys() & dict(self.named_children()).keys()
+        if clashes:
+            raise ValueError(
+                f'distribution "{distribution}" must not name a submodule as the actor does, '
+                f"got {sorted(clashes)}"
+            )
+        self.density = TanhSquashed(density)
+        self.action_dist = ActionDistributionAdapter(self.density)  # type: ignore[assignment]
+        self.register_state_dict_post_hook(_lift_heads)
+        self.register_load_state_dict_pre_hook(_lower_heads)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = BasePolicy._get_constructor_parameters(self)
+        data.update(
+            net_arch=self.net_arch,
+            features_dim=self.features_dim,
+            features_extractor=self.features_extractor,
+            activation_fn=self.activation_fn,
+            distribution=self.distribution,
+            distribution_kwargs=self.distribution_kwargs,
+        )
+        return data
+
+    def context(self, obs: PyTorchObs) -> th.Tensor:
+        """Return the features h that the density is conditioned on, shape (batch, H)."""
+        return self.latent_pi(self.extract_features(obs, self.features_extractor))
+
+    def draw_noise(self, context: th.Tensor, *sample_shape: int) -> th.Tensor:
+        """Draw standard normal noise that fits ``context``, shape (sample_shape, batch, M)."""
+        shape = (*sample_shape, *context.shape[:-1], self.density.noise_dim)
+        return th.randn(shape, dtype=context.dtype, device=context.device)
+
+    def forward(
+        self, obs: PyTorchObs, deterministic: bool = False, noise: th.Tensor | None = None
+    ) -> th.Tensor:
+        """Return actions in [-1, 1], shape (batch, D).
+
+        Args:
+            obs: Batch of observations.
+            deterministic: Whether to return the density's mode instead of a sample.
+            noise: Standard normals to sample with, shape (batch, M). Default: drawn here.
+        """
+        if deterministic:
+            return self.density.mode(self.context(obs))
+        return self.action_log_prob(obs, noise)[0]
+
+    def action_log_prob(
+        self, obs: PyTorchObs, noise: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Sample actions by reparametrisation and score them, in one pass.
+
+        Args:
+            obs: Batch of observations.
+            noise: Standard normals to sample with, shape (batch, M). Default: drawn here.
+
+        Returns:
+            Actions in [-1, 1], shape (batch, D), and their log-density, shape (batch,).
+        """
+        context = self.context(obs)
+        noise = self.draw_noise(context) if noise is None else noise
+        return self.density.rsample_and_log_prob(context, noise)
+
+    def log_prob(self, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
+        """Score arbitrary actions; the edge of the box gives a finite value.
+
+        Args:
+            obs: Batch of observations.
+            action: Actions in SB3's scaled [-1, 1], shape (batch, D) or unflattened.
+
+        Returns:
+            Log-density in nats, shape (batch,).
+        """
+        action = action.reshape(-1, self.density.action_dim)
+        return self.density.log_prob(self.context(obs), action)
+
+    @th.no_grad()
+    def entropy(self, obs: PyTorchObs, n_samples: int = 64) -> th.Tensor:
+        """Estimate the entropy of the squashed policy by Monte Carlo.
+
+        Args:
+            obs: Batch of observations.
+            n_samples: Number of samples per observation.
+
+        Returns:
+            Entropy in nats, shape (batch,); at most D log 2, that of the uniform distribution.
+        """
+        context = self.context(obs)
+        noise = self.draw_noise(context, n_samples)
+        return -self.density.rsample_and_log_prob(context, noise)[1].mean(0)
+
+    @th.no_grad()
+    def action_correlation(self, obs: PyTorchObs, n_samples: int = 1024) -> th.Tensor:
+        """Estimate Pearson's correlation of the action dimensions (thesis eq. 3.1).
+
+        Args:
+            obs: Batch of observations.
+            n_samples: Number of samples per observation.
+
+        Returns:
+            Correlation matrices, shape (batch, D, D), entries in [-1, 1].
+        """
+        context = self.context(obs)
+        noise = self.draw_noise(context, n_samples)
+        actions = self.density.rsample_and_log_prob(context, noise)[0].movedim(0, -1)
+        centred = actions - actions.mean(-1, keepdim=True)
+        # A dimension that never varies correlates with nothing but itself.
+        tiny = th.finfo(actions.dtype).tiny
+        unit = centred / centred.norm(dim=-1, keepdim=True).clamp_min(tiny)
+        correlation = (unit @ unit.mT).clamp(-1, 1)
+        return correlation.diagonal_scatter(th.ones_like(correlation[..., 0]), dim1=-2, dim2=-1)
+
+
+def _lift_heads(
+    actor: nn.Module, state_dict: dict[str, Any], prefix: str, local_metadata: dict[str, Any]
+) -> None:
+    inner = prefix + _HEAD_PREFIX
+    for key in [key for key in state_dict if key.startswith(inner)]:
+        state_dict[prefix + key.removeprefix(inner)] = state_dict.pop(key)
+
+
+def _lower_heads(actor: FlowActor, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
+    for name in actor.density.base.state_dict():
+        if prefix + name in state_dict:
+            state_dict[prefix + _HEAD_PREFIX + name] = state_dict.pop(prefix + name)

@@ -1,0 +1,167 @@
+"""Policy classes for SAC: the same arguments as SB3's, and two more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+)
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.sac.policies import Actor, SACPolicy
+
+from sb3_flowpolicy.policies.actor import FlowActor
+
+
+class DistributionPolicy(SACPolicy):
+    """SAC policy with a registered density as its action distribution.
+
+    Args:
+        observation_space: Observation space.
+        action_space: Box with finite bounds, of any shape.
+        lr_schedule: Learning rate schedule.
+        distribution: Name of a registered density. Default: the policy class's own.
+        distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
+        **sac_policy_kwargs: Everything that SB3's ``SACPolicy`` takes: ``net_arch``,
+            ``activation_fn``, ``features_extractor_class``, ``optimizer_kwargs``, ``n_critics``,
+            ``share_features_extractor``, ...
+
+    Raises:
+        ValueError: If the action space is no bounded Box, the density or one of its arguments
+            is unknown, or ``use_sde=True`` is asked of anything but the diagonal normal
+            distribution (whose actor is then SB3's own).
+    """
+
+    default_distribution: ClassVar[str]
+    default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        *,
+        distribution: str | None = None,
+        distribution_kwargs: Mapping[str, Any] | None = None,
+        **sac_policy_kwargs: Any,
+    ) -> None:
+        bounded = (
+            isinstance(action_space, spaces.Box)
+            and np.isfinite([action_space.low, action_space.high]).all()
+        )
+        if not bounded:
+            raise ValueError(f"action_space must be a Box with finite bounds, got {action_space}")
+        # Plain attributes before super().__init__(), which builds the actor.
+        self.distribution = self.default_distribution if distribution is None else distribution
+        self.distribution_kwargs = dict(distribution_kwargs or {})
+        if sac_policy_kwargs.get("use_sde") and self.distribution != "gaussian":
+            raise ValueError(
+                "use_sde must be False unless distribution is 'gaussian': gSDE is a linear noise "
+                f"of its own, got use_sde=True with {self.distribution!r}"
+            )
+        sac_policy_kwargs.setdefault(
+            "features_extractor_class", self.default_features_extractor_class
+        )
+        super().__init__(observation_space, action_space, lr_schedule, **sac_policy_kwargs)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """Build the actor; called once, by ``SACPolicy``."""
+        if self.actor_kwargs["use_sde"]:
+            return super().make_actor(features_extractor)
+        net_args = self._update_features_extractor(self.net_args, features_extractor)
+        actor = FlowActor(
+            **net_args,
+            distribution=self.distribution,
+            distribution_kwargs=self.distribution_kwargs,
+        )
+        return actor.to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            distribution=self.distribution,
+            distribution_kwargs=self.distribution_kwargs,
+            # Missing in SB3's: a policy that shares its extractor would load as one that does not.
+            share_features_extractor=self.share_features_extractor,
+        )
+        return data
+
+
+class GaussPolicy(DistributionPolicy):
+    """Diagonal normal distribution (thesis: Gauss-Agent): stock SAC, on our code.
+
+    Example:
+        >>> from stable_baselines3 import SAC
+        >>> model = SAC(GaussPolicy, "Pendulum-v1", learning_starts=10).learn(20)
+    """
+
+    default_distribution = "gaussian"
+
+
+class LowRankPolicy(DistributionPolicy):
+    """Normal distribution with low-rank covariance (thesis: LR-Agent); actions correlate.
+
+    Example:
+        >>> from stable_baselines3 import SAC
+        >>> kwargs = dict(distribution_kwargs=dict(rank=1))
+        >>> model = SAC(LowRankPolicy, "Pendulum-v1", policy_kwargs=kwargs)
+    """
+
+    default_distribution = "low_rank"
+
+
+class FlowPolicy(DistributionPolicy):
+    """Conditional RealNVP (thesis: NF-Agent); the distribution correlates and bends.
+
+    Example:
+        >>> from stable_baselines3 import SAC
+        >>> kwargs = dict(distribution_kwargs=dict(layers=6, hidden=(16, 16)))
+        >>> model = SAC(FlowPolicy, "Pendulum-v1", policy_kwargs=kwargs)
+        >>> obs = model.get_env().reset()
+        >>> model.predict(obs)[0].shape
+        (1, 1)
+    """
+
+    default_distribution = "realnvp"
+
+
+class CnnGaussPolicy(GaussPolicy):
+    """:class:`GaussPolicy` for image observations."""
+
+    default_features_extractor_class = NatureCNN
+
+
+class CnnLowRankPolicy(LowRankPolicy):
+    """:class:`LowRankPolicy` for image observations."""
+
+    default_features_extractor_class = NatureCNN
+
+
+class CnnFlowPolicy(FlowPolicy):
+    """:class:`FlowPolicy` for image observations."""
+
+    default_features_extractor_class = NatureCNN
+
+
+class MultiInputGaussPolicy(GaussPolicy):
+    """:class:`GaussPolicy` for dictionary observations."""
+
+    default_features_extractor_class = CombinedExtractor
+
+
+class MultiInputLowRankPolicy(LowRankPolicy):
+    """:class:`LowRankPolicy` for dictionary observations."""
+
+    default_features_extractor_class = CombinedExtractor
+
+
+class MultiInputFlowPolicy(FlowPolicy):
+    """:class:`FlowPolicy` for dictionary observations."""
+
+    default_features_extractor_class = CombinedExtractor

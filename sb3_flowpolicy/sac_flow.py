@@ -1,0 +1,180 @@
+"""SACFlow: SB3's SAC with the options of the thesis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_flowpolicy import policies
+from sb3_flowpolicy.demonstrations import fill_replay_buffer, load_demonstrations
+
+# SB3 halves the squared error, spinningup (and the thesis) does not.
+SB3_CRITIC_LOSS_COEF = 0.5
+
+SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
+
+
+class SACFlow(SAC):
+    r"""Soft Actor-Critic with action distributions that correlate and bend.
+
+    Everything of SB3's :class:`~stable_baselines3.SAC` holds. In particular a fixed temperature
+    is ``ent_coef=0.01``, a learned one ``ent_coef="auto"`` with any ``target_entropy``, and
+    weight decay goes through ``policy_kwargs=dict(optimizer_kwargs=dict(weight_decay=...))``.
+
+    Args:
+        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``,
+            their ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
+        env: Environment, its registered id, or a ``VecEnv``.
+        *sac_args: Further arguments of SB3's SAC, in its order: ``learning_rate``, ...
+        random_steps: Number of environment steps with uniformly random actions at the start.
+            Default: ``learning_starts``, as in SB3, where one number decides both when random
+            actions end and when updates begin (thesis: "initial random steps", "update after").
+        demonstrations: Transitions to put into the replay buffer before learning, as an
+            ``.npz`` file or as arrays; see :meth:`add_demonstrations`.
+        critic_loss_coef: Factor of the critics' summed mean squared error, above 0: 0.5 as in
+            SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels but for
+            weight decay, which weighs half as much at 1.0.
+        **sac_kwargs: Keyword arguments of SB3's SAC.
+
+    Raises:
+        ValueError: If an argument is out of range, the environment's action space is no Box
+            with finite bounds, or demonstrations are incomplete.
+
+    References:
+        Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis
+        Algorithm 2 and sections 2.2 and 3.3.3.
+
+    Example:
+        >>> from sb3_flowpolicy import SACFlow
+        >>> model = SACFlow("FlowPolicy", "Pendulum-v1", ent_coef=0.1, random_steps=20, seed=0)
+        >>> _ = model.learn(30)
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.FlowPolicy,
+        "CnnPolicy": policies.CnnFlowPolicy,
+        "MultiInputPolicy": policies.MultiInputFlowPolicy,
+        "FlowPolicy": policies.FlowPolicy,
+        "CnnFlowPolicy": policies.CnnFlowPolicy,
+        "MultiInputFlowPolicy": policies.MultiInputFlowPolicy,
+        "LowRankPolicy": policies.LowRankPolicy,
+        "CnnLowRankPolicy": policies.CnnLowRankPolicy,
+        "MultiInputLowRankPolicy": policies.MultiInputLowRankPolicy,
+        "GaussPolicy": policies.GaussPolicy,
+        "CnnGaussPolicy": policies.CnnGaussPolicy,
+        "MultiInputGaussPolicy": policies.MultiInputGaussPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str,
+        *sac_args: Any,
+        random_steps: int | None = None,
+        demonstrations: str | Path | Mapping[str, np.ndarray] | None = None,
+        critic_loss_coef: float = SB3_CRITIC_LOSS_COEF,
+        **sac_kwargs: Any,
+    ) -> None:
+        if random_steps is not None and random_steps < 0:
+            raise ValueError(f"random_steps must be at least 0, got {random_steps}")
+        if not 0 < critic_loss_coef < float("inf"):
+            raise ValueError(f"critic_loss_coef must be above 0, got {critic_loss_coef}")
+        self.random_steps = random_steps
+        self.critic_loss_coef = critic_loss_coef
+        self._demonstrations = (
+            None if demonstrations is None else load_demonstrations(demonstrations)
+        )
+        try:
+            super().__init__(policy, env, *sac_args, **sac_kwargs)
+        except AssertionError as error:  # how SB3 refuses an environment
+            raise ValueError(str(error)) from error
+
+    def add_demonstrations(self, demonstrations: str | Path | Mapping[str, np.ndarray]) -> int:
+        """Append transitions to the replay buffer (thesis section 3.3.3).
+
+        Args:
+            demonstrations: Path of an ``.npz`` file, or a mapping, with the arrays
+                ``observations``, ``actions`` (in the environment's units), ``rewards``,
+                ``next_observations``, ``terminations`` and ``truncations``, one row per step,
+                as :func:`~sb3_flowpolicy.demonstrations.record_demonstrations` makes them.
+
+        Returns:
+            Number of transitions that were added.
+
+        Raises:
+            ValueError: If arrays are missing or of different lengths, do not fit into the
+                buffer, or the buffer is of a kind that cannot take them.
+        """
+        if self.replay_buffer is None:
+            raise ValueError("demonstrations need a model that has its replay buffer, got None")
+        return fill_replay_buffer(
+            self.replay_buffer, self.policy, load_demonstrations(demonstrations)
+        )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        # Here and not at construction: a model that is loaded to act needs no demonstrations.
+        if self._demonstrations is not None:
+            self.add_demonstrations(self._demonstrations)
+            self._demonstrations = None
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        random_steps = learning_starts if self.random_steps is None else self.random_steps
+        return super()._sample_action(random_steps, action_noise, n_envs)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Do ``gradient_steps`` updates with minibatches of ``batch_size`` transitions."""
+        if self.critic_loss_coef == SB3_CRITIC_LOSS_COEF:
+            return super().train(gradient_steps, batch_size)
+        factor = self.critic_loss_coef / SB3_CRITIC_LOSS_COEF
+
+        def scale_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
+            for group in optimizer.param_groups:
+                for parameter in group["params"]:
+                    if parameter.grad is not None:
+                        parameter.grad.mul_(factor)
+
+        hook = self.critic.optimizer.register_step_pre_hook(scale_gradient)
+        try:
+            super().train(gradient_steps, batch_size)
+        finally:
+            hook.remove()
+        self.logger.name_to_value["train/critic_loss"] *= factor
+
+    def learn(
+        self: SelfSACFlow,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "SACFlow",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfSACFlow:
+        """Train as SB3's ``SAC.learn`` does; same arguments, same return value."""
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_demonstrations"]
