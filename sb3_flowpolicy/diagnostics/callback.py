@@ -1,0 +1,146 @@
+"""A callback that shows on TensorBoard what the policy's distribution looks like."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import cast
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_flowpolicy.diagnostics.figures import correlation_figure, samples_figure
+from sb3_flowpolicy.diagnostics.layout import DASHBOARD
+from sb3_flowpolicy.policies import FlowActor
+
+# Pictures belong on TensorBoard; the text formats of SB3's logger refuse them.
+_TEXT_FORMATS = ("stdout", "log", "json", "csv")
+
+
+class PolicyDiagnosticsCallback(BaseCallback):
+    r"""Log entropy, spread, correlation and value of the policy, as numbers and as pictures.
+
+    Measured at states of the replay buffer, with random numbers of its own: a run with the
+    callback and one without are the same run. Training return and success rate come from SB3's
+    logger, test return from ``EvalCallback`` (rl_zoo3 adds one); the dashboard arranges them all.
+
+    ====================================  ======================================================
+    key                                   meaning
+    ====================================  ======================================================
+    ``policy/entropy``                    entropy of the squashed policy, nats
+    ``policy/scale_i``                    standard deviation of action i, given the state
+    ``policy/mean_abs_correlation``       mean of \|correlation\| over pairs of actions
+    ``policy/correlation``                mean of \|correlation\| per pair, picture
+    ``policy/samples``                    action samples at four states, picture (D = 2)
+    ``value/q_policy``                    mean Q of the policy's own actions, all critics
+    ``value/q_buffer``                    mean Q of the actions in the replay buffer
+    ====================================  ======================================================
+
+    Args:
+        log_freq: Environment steps between two measurements, at least 1.
+        image_freq: Environment steps between two sets of pictures; 0 draws none.
+        n_states: Number of states to measure at, at least 1.
+        n_samples: Number of actions per state, at least 2.
+
+    Raises:
+        ValueError: If an argument is out of range, or the model's actor is not ours.
+
+    Example:
+        >>> from sb3_flowpolicy import SACFlow
+        >>> model = SACFlow("FlowPolicy", "Pendulum-v1", learning_starts=50)
+        >>> callback = PolicyDiagnosticsCallback(log_freq=100, image_freq=0)
+        >>> _ = model.learn(150, callback=callback)
+    """
+
+    model: OffPolicyAlgorithm
+
+    def __init__(
+        self,
+        log_freq: int = 1000,
+        image_freq: int = 10_000,
+        n_states: int = 256,
+        n_samples: int = 64,
+    ) -> None:
+        super().__init__()
+        self.log_freq = _at_least("log_freq", log_freq, 1)
+        self.image_freq = _at_least("image_freq", image_freq, 0)
+        self.n_states = _at_least("n_states", n_states, 1)
+        self.n_samples = _at_least("n_samples", n_samples, 2)
+
+    def _on_training_start(self) -> None:
+        if not isinstance(self.model.actor, FlowActor):
+            raise ValueError(
+                "PolicyDiagnosticsCallback needs a policy of sb3_flowpolicy, "
+                f"got {type(self.model.policy).__name__}"
+            )
+        self._actor = self.model.actor
+        for output in self.logger.output_formats:
+            if isinstance(output, TensorBoardOutputFormat):
+                output.writer.add_custom_scalars(DASHBOARD)
+
+    def _on_step(self) -> bool:
+        buffer = self.model.replay_buffer
+        if self.num_timesteps <= self.model.learning_starts or buffer is None:
+            return True
+        if self._due(self.log_freq):
+            with self._own_random_numbers(), th.no_grad():
+                data = buffer.sample(self.n_states, env=self.model.get_vec_normalize_env())
+                draw = self.image_freq > 0 and self._due(self.image_freq)
+                self._measure(data.observations, data.actions, draw)
+        return True
+
+    def _due(self, freq: int) -> bool:
+        """Whether the step just taken crossed a multiple of ``freq``, with any number of envs."""
+        return self.num_timesteps % freq < self.training_env.num_envs
+
+    def _measure(self, obs: PyTorchObs, buffer_actions: th.Tensor, draw: bool) -> None:
+        actor, critic = self._actor, cast("ContinuousCritic", self.model.policy.critic)
+        was_training = self.model.policy.training
+        self.model.policy.set_training_mode(False)
+        context = actor.context(obs)
+        noise = actor.draw_noise(context, self.n_samples)
+        actions, log_prob = actor.density.rsample_and_log_prob(context, noise)
+        correlation = actor.action_correlation(obs, self.n_samples).abs().mean(0)
+        q_policy = th.cat(critic(obs, actions[0]), dim=1)
+        q_buffer = th.cat(critic(obs, buffer_actions), dim=1)
+        self.model.policy.set_training_mode(was_training)
+
+        record = self.logger.record
+        record("policy/entropy", -log_prob.mean().item())
+        for i, scale in enumerate(actions.std(0).mean(0).tolist()):
+            record(f"policy/scale_{i}", scale)
+        record("value/q_policy", q_policy.mean().item())
+        record("value/q_buffer", q_buffer.mean().item())
+        n_dims = len(correlation)
+        if n_dims > 1:
+            off_diagonal = (correlation.sum() - n_dims) / (n_dims * (n_dims - 1))
+            record("policy/mean_abs_correlation", off_diagonal.item())
+        if draw and n_dims > 1:
+            figure = correlation_figure(correlation.cpu().numpy())
+            record("policy/correlation", Figure(figure, close=True), exclude=_TEXT_FORMATS)
+        if draw and n_dims == 2:
+            figure = samples_figure(actions[:, :4].movedim(0, 1).cpu().numpy())
+            record("policy/samples", Figure(figure, close=True), exclude=_TEXT_FORMATS)
+
+    @contextmanager
+    def _own_random_numbers(self) -> Iterator[None]:
+        """Leave the global generators as they were: looking must not change the run."""
+        state = np.random.get_state()  # noqa: NPY002 (SB3's buffers draw from the global state)
+        with th.random.fork_rng(
+            devices=[self.model.device] if self.model.device.type == "cuda" else []
+        ):
+            try:
+                yield
+            finally:
+                np.random.set_state(state)  # noqa: NPY002
+
+
+def _at_least(name: str, value: int, least: int) -> int:
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+    return value

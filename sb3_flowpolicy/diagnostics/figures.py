@@ -1,0 +1,81 @@
+"""Pictures of an action distribution. Needs matplotlib (extra ``zoo``)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+POLICY_BLUE = "#1f6fb4"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return a figure that belongs to no window and no pyplot state.
+
+    Raises:
+        ModuleNotFoundError: If matplotlib is missing, with what to install.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            'pictures need matplotlib: pip install "sb3_flowpolicy[zoo]"'
+        ) from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def correlation_figure(correlation: np.ndarray) -> Figure:
+    """Draw the absolute correlation of all pairs of actions (thesis Fig. 3.17).
+
+    Args:
+        correlation: Matrix of shape (D, D), entries in [-1, 1].
+
+    Returns:
+        A matplotlib figure.
+
+    Example:
+        >>> import numpy as np
+        >>> correlation_figure(np.eye(3)).axes[0].get_xlabel()
+        'action'
+    """
+    figure = new_figure(4.2, 3.6)
+    axes = figure.add_subplot()
+    image = axes.imshow(np.abs(correlation), vmin=0, vmax=1, cmap="viridis")
+    axes.set(xlabel="action", ylabel="action")
+    ticks = np.arange(len(correlation))
+    axes.set_xticks(ticks)
+    axes.set_yticks(ticks)
+    if len(correlation) <= 8:
+        for i, j in np.ndindex(correlation.shape):
+            value = abs(correlation[i, j])
+            colour = "black" if value > 0.6 else "white"
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=8)
+    figure.colorbar(image, label="|correlation|")
+    return figure
+
+
+def samples_figure(samples: np.ndarray) -> Figure:
+    """Scatter samples of two-dimensional actions, one panel per state.
+
+    Args:
+        samples: Squashed actions, shape (states, samples, 2).
+
+    Returns:
+        A matplotlib figure.
+
+    Raises:
+        ValueError: If the actions are not two-dimensional.
+    """
+    if samples.ndim != 3 or samples.shape[-1] != 2:
+        raise ValueError(f"samples must have shape (states, samples, 2), got {samples.shape}")
+    figure = new_figure(2.4 * len(samples), 2.5)
+    for axes, points in zip(
+        figure.subplots(1, len(samples), squeeze=False)[0], samples, strict=True
+    ):
+        axes.scatter(*points.T, s=4, alpha=0.5, color=POLICY_BLUE, linewidths=0)
+        axes.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), aspect="equal")
+        axes.tick_params(labelsize=7)
+    return figure
