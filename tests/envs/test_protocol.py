@@ -1,0 +1,84 @@
+"""What every environment of the package has to fulfil; a new id is tested by being registered."""
+
+import copy
+import hashlib
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from flowpolicy_envs.registration import TUNNEL_IDS
+
+IDS = list(TUNNEL_IDS)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_gymnasium_has_nothing_to_object(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(env_id).unwrapped)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_stable_baselines3_has_nothing_to_object(env_id):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gym.make(env_id, render_mode="rgb_array"))
+
+
+def rollout(env: gym.Env, steps: int, rng: np.random.Generator) -> list[tuple]:
+    outcomes = []
+    for _ in range(steps):
+        # Short steps, so that episodes are more than one step long.
+        observation, *outcome = env.step(rng.uniform(-0.3, 0.3, env.action_space.shape))
+        outcomes.append((observation.tobytes(), *outcome))
+        if outcome[1] or outcome[2]:
+            outcomes.append((env.reset()[0].tobytes(),))
+    return outcomes
+
+
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("env_id", IDS)
+def test_copies_go_on_alike_and_independently(env_id, clone):
+    env = gym.make(env_id, start_noise=0.1, render_mode="rgb_array", render_size=32)
+    env.reset(seed=3)
+    rollout(env, 10, np.random.default_rng(0))
+    env.render()
+    twin = clone(env)
+    expected = rollout(env, 50, np.random.default_rng(1))
+    assert rollout(twin, 50, np.random.default_rng(1)) == expected
+    assert np.array_equal(twin.render(), env.render())
+
+
+def fingerprint(env_id: str) -> str:
+    env = gym.make(env_id, start_noise=0.1)
+    observation, _ = env.reset(seed=7)
+    outcomes = rollout(env, 200, np.random.default_rng(7))
+    return hashlib.sha256(repr((observation.tobytes(), outcomes)).encode()).hexdigest()
+
+
+def test_another_process_sees_the_same_numbers():
+    program = (
+        "import runpy, sys, flowpolicy_envs\n"
+        "tests = runpy.run_path(sys.argv[1])\n"
+        "print(*[tests['fingerprint'](i) for i in sys.argv[2:]])"
+    )
+    command = [sys.executable, "-c", program, __file__, *IDS]
+    run = subprocess.run(command, capture_output=True, check=True, text=True)
+    assert run.stdout.split() == [fingerprint(env_id) for env_id in IDS]
+    # Tunnel-v0 is the diagonal by default; all others differ.
+    assert len(set(run.stdout.split())) == len(IDS) - 1
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_seeds_matter_only_with_a_random_start(env_id):
+    for noise in (0.0, 0.1):
+        env = gym.make(env_id, start_noise=noise)
+        starts = {env.reset(seed=seed)[0].tobytes() for seed in range(5)}
+        assert len(starts) == (5 if noise else 1)
