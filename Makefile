@@ -20,9 +20,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 train: $(VENV)/.installed  ## Train ALGO on ENV with SEED, print the success rate, draw the policy
-	$(BIN)/python -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) \
-		--log-folder $(LOGS) --tensorboard-log $(LOGS)/tensorboard --progress
-	$(BIN)/python -m sb3_flowpolicy.diagnostics --algo $(ALGO) --env $(ENV) --folder $(LOGS)
+	$(BIN)/python -m rl_zoo3.train --algo $(ALGO) --env $(ENV) --seed $(SEED) --progress \
+		--log-folder $(LOGS) --tensorboard-log $(LOGS)/tensorboard --eval-freq 2500 \
+		--num-threads 1 --verbose 0
+	$(BIN)/python -m sb3_flowpolicy.zoo.evaluate --algo $(ALGO) --env $(ENV) --folder $(LOGS)
 
 test: $(VENV)/.installed  ## Run the tests
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal

@@ -144,7 +144,7 @@ def test_bad_arguments(kwargs: dict, message: str) -> None:
 
 
 def test_discrete_and_unbounded_actions_are_refused() -> None:
-    with pytest.raises(ValueError, match="only supports .*Box.* as action spaces but Discrete"):
+    with pytest.raises(ValueError, match=r"only supports .*Box.* as action spaces but Discrete"):
         SACFlow("FlowPolicy", IdentityEnv(3))
     env = gym.make("Pendulum-v1")
     env.action_space = gym.spaces.Box(-np.inf, np.inf, (1,))

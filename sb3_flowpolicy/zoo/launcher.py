@@ -1,0 +1,23 @@
+"""Runs rl_zoo3's scripts with our algorithms, without relying on the start-up hook."""
+
+import runpy
+from importlib.util import find_spec
+
+from sb3_flowpolicy.zoo.registration import register
+
+INSTALL_HINT = 'rl_zoo3 is not installed. Install it with: pip install "sb3_flowpolicy[zoo]"'
+
+
+def run(script: str) -> None:
+    """Run `python -m rl_zoo3.<script>` in this process, with this process's arguments.
+
+    Args:
+        script: Name of a module of rl_zoo3 that can be run, such as `"train"`.
+
+    Raises:
+        SystemExit: If rl_zoo3 is not installed; says how to install it.
+    """
+    if find_spec("rl_zoo3") is None:
+        raise SystemExit(INSTALL_HINT)
+    register()
+    runpy.run_module(f"rl_zoo3.{script}", run_name="__main__", alter_sys=True)

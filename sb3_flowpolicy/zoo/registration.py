@@ -1,0 +1,105 @@
+"""What rl_zoo3 has to know about us, module by module."""
+
+import functools
+import importlib
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+ALGORITHMS = ("sac_flow", "sac_lowrank", "sac_gauss")
+"""Names for `--algo`. All are `SACFlow`: the policy is named in the hyperparameter file."""
+
+_MARK = "_knows_sb3_flowpolicy"
+
+
+def hyperparameter_file(algorithm: str) -> Path:
+    """Path of the YAML file that rl_zoo3 reads when no `-conf` is given.
+
+    Args:
+        algorithm: One of `ALGORITHMS`.
+
+    Raises:
+        ValueError: If the algorithm is not ours.
+
+    Example:
+        >>> hyperparameter_file("sac_flow").name
+        'sac_flow.yml'
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"algorithm must be one of {ALGORITHMS}, got {algorithm!r}")
+    package = importlib.import_module("zoo_hyperparams")
+    return Path(package.__path__[0], f"{algorithm}.yml")
+
+
+def register() -> None:
+    """Make rl_zoo3 know our algorithms, environments, files and samplers, in this process.
+
+    May be called any number of times, and after rl_zoo3 was imported.
+
+    Raises:
+        ModuleNotFoundError: If rl_zoo3 is not installed.
+
+    Example:
+        >>> register()
+        >>> from rl_zoo3 import ALGOS
+        >>> "sac_flow" in ALGOS
+        True
+    """
+    for name in _PLUGS:
+        plug_in(importlib.import_module(name))
+
+
+def plug_in(module: ModuleType) -> None:
+    """Extend one module of rl_zoo3 in place; any other module is left alone.
+
+    Args:
+        module: A module that has run completely, such as `rl_zoo3.utils`.
+    """
+    plug = _PLUGS.get(module.__name__)
+    if plug is not None:
+        plug(module)
+
+
+def _plug_into_utils(module: ModuleType) -> None:
+    import flowpolicy_envs  # noqa: F401, registers the environments
+    from sb3_flowpolicy.sac_flow import SACFlow
+
+    module.ALGOS.update(dict.fromkeys(ALGORITHMS, SACFlow))
+
+
+def _plug_into_hyperparams_opt(module: ModuleType) -> None:
+    from sb3_flowpolicy.zoo.samplers import CONVERTERS, SAMPLERS
+
+    module.HYPERPARAMS_SAMPLER.update(SAMPLERS)
+    module.HYPERPARAMS_CONVERTER.update(CONVERTERS)
+
+
+def _plug_into_exp_manager(module: ModuleType) -> None:
+    manager = module.ExperimentManager
+    if not getattr(manager.__init__, _MARK, False):
+        manager.__init__ = _with_our_files(manager.__init__)
+        setattr(manager.__init__, _MARK, True)
+
+
+def _with_our_files(init: Callable[..., None]) -> Callable[..., None]:
+    """Wrap `ExperimentManager.__init__`: rl_zoo3 looks for default files in its own folder only."""
+    signature = inspect.signature(init)
+
+    @functools.wraps(init)
+    def wrapped(*args: Any, **kwargs: Any) -> None:
+        call = signature.bind(*args, **kwargs)
+        algorithm = call.arguments["algo"]
+        if algorithm in ALGORITHMS and not call.arguments.get("config"):
+            call.arguments["config"] = str(hyperparameter_file(algorithm))
+        init(*call.args, **call.kwargs)
+
+    return wrapped
+
+
+_PLUGS: dict[str, Callable[[ModuleType], None]] = {
+    "rl_zoo3.utils": _plug_into_utils,
+    "rl_zoo3.hyperparams_opt": _plug_into_hyperparams_opt,
+    "rl_zoo3.exp_manager": _plug_into_exp_manager,
+}

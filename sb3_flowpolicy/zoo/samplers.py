@@ -1,0 +1,107 @@
+"""Optuna search spaces: rl_zoo3's for SAC, plus the shape of the action distribution.
+
+rl_zoo3 lets the sampled `policy_kwargs` replace those of the YAML file. Ours are laid over them,
+so that weight decay and the like stay as configured. For `--trial-id`, rl_zoo3 hands the converter
+nothing but the parameters of the trial; what was kept is therefore stored as one of them.
+"""
+
+import ast
+import json
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import optuna
+
+Sampler = Callable[["optuna.Trial", int, int, dict[str, Any]], dict[str, Any]]
+
+FLOW_HIDDEN = {"small": [10, 10], "medium": [32, 32]}
+"""Units of a coupling layer's conditioner. Small is the thesis's."""
+
+_KEPT = "kept_policy_kwargs"
+_TUNED = ("layers", "hidden", "rank")
+
+
+def convert(params: dict[str, Any]) -> dict[str, Any]:
+    """Turn the parameters of a trial into arguments of `SACFlow`.
+
+    Args:
+        params: `trial.params` of a trial that one of `SAMPLERS` filled.
+
+    Returns:
+        Keyword arguments, `policy_kwargs` complete.
+
+    Example:
+        >>> params = dict(one_minus_gamma=0.02, net_arch="small", rank=3)
+        >>> convert(params)["policy_kwargs"]
+        {'net_arch': [64, 64], 'distribution_kwargs': {'rank': 3}}
+    """
+    from rl_zoo3.hyperparams_opt import convert_offpolicy_params
+
+    sac = {name: value for name, value in params.items() if name not in (_KEPT, *_TUNED)}
+    return _complete(convert_offpolicy_params(sac), params)
+
+
+def _sampler(suggest: Callable[["optuna.Trial", int], None]) -> Sampler:
+    """Build a sampler out of what it suggests in addition to rl_zoo3's sampler for SAC."""
+
+    def sample(
+        trial: "optuna.Trial", n_actions: int, n_envs: int, additional_args: dict[str, Any]
+    ) -> dict[str, Any]:
+        from rl_zoo3.hyperparams_opt import sample_sac_params
+
+        hyperparams = sample_sac_params(trial, n_actions, n_envs, additional_args)
+        suggest(trial, n_actions)
+        trial.suggest_categorical(_KEPT, [json.dumps(_configured_policy_kwargs(trial))])
+        return _complete(hyperparams, trial.params)
+
+    return sample
+
+
+def _suggest_flow(trial: "optuna.Trial", n_actions: int) -> None:
+    trial.suggest_categorical("layers", [2, 4, 6])
+    trial.suggest_categorical("hidden", list(FLOW_HIDDEN))
+
+
+def _suggest_lowrank(trial: "optuna.Trial", n_actions: int) -> None:
+    # A rank beyond the number of actions adds parameters but no covariance.
+    trial.suggest_int("rank", 1, min(4, n_actions))
+
+
+def _suggest_nothing(trial: "optuna.Trial", n_actions: int) -> None:
+    pass
+
+
+def _complete(hyperparams: dict[str, Any], params: dict[str, Any]) -> dict[str, Any]:
+    """Lay the sampled `policy_kwargs` and distribution over the configured ones."""
+    kept = json.loads(params.get(_KEPT, "{}"))
+    tuned = {name: params[name] for name in _TUNED if name in params}
+    if "hidden" in tuned:
+        tuned["hidden"] = FLOW_HIDDEN[tuned["hidden"]]
+    policy_kwargs = {**kept, **hyperparams["policy_kwargs"]}
+    if tuned:
+        policy_kwargs["distribution_kwargs"] = {**kept.get("distribution_kwargs", {}), **tuned}
+    return {**hyperparams, "policy_kwargs": policy_kwargs}
+
+
+def _configured_policy_kwargs(trial: "optuna.Trial") -> dict[str, Any]:
+    """Read the YAML file's `policy_kwargs`, which rl_zoo3 writes down in the study as text."""
+    text = trial.study.user_attrs.get("policy_kwargs", "{}")
+    try:
+        return ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        warnings.warn(
+            f"policy_kwargs must be plain numbers, strings and lists to be kept while "
+            f"tuning, got {text}: using the sampled ones alone",
+            stacklevel=2,
+        )
+        return {}
+
+
+SAMPLERS: dict[str, Sampler] = {
+    "sac_flow": _sampler(_suggest_flow),
+    "sac_lowrank": _sampler(_suggest_lowrank),
+    "sac_gauss": _sampler(_suggest_nothing),
+}
+CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = dict.fromkeys(SAMPLERS, convert)

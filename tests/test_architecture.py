@@ -1,0 +1,84 @@
+"""The floors of the house: each package imports only what stands below it."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# From the ground up. A package may import those before it, and nothing after.
+FLOORS = ["distributions", "policies", "demonstrations", "sac_flow", "diagnostics", "zoo"]
+THIRD_PARTY = {
+    "distributions": {"torch"},
+    "policies": {"torch", "numpy", "gymnasium", "stable_baselines3"},
+}
+
+
+def imports(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def files(floor: str) -> list[Path]:
+    package = ROOT / "sb3_flowpolicy" / floor
+    return sorted(package.rglob("*.py")) if package.is_dir() else [package.with_suffix(".py")]
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_imports_point_down(floor: str) -> None:
+    allowed = {f"sb3_flowpolicy.{below}" for below in FLOORS[: FLOORS.index(floor) + 1]}
+    for path in files(floor):
+        for name in imports(path):
+            if name.startswith("sb3_flowpolicy."):
+                assert ".".join(name.split(".")[:2]) in allowed, f"{path} imports {name}"
+
+
+@pytest.mark.parametrize("floor", THIRD_PARTY)
+def test_lower_floors_need_few_libraries(floor: str) -> None:
+    allowed = THIRD_PARTY[floor] | set(sys.stdlib_module_names) | {"sb3_flowpolicy"}
+    for path in files(floor):
+        assert {name.split(".")[0] for name in imports(path)} <= allowed, path
+
+
+def test_every_package_has_its_floor() -> None:
+    package = ROOT / "sb3_flowpolicy"
+    entries = {path.stem for path in package.iterdir() if path.suffix in ("", ".py")}
+    assert entries - {"__init__", "__pycache__"} == set(FLOORS)
+
+
+@pytest.mark.parametrize(
+    ("statement", "unwanted"),
+    [
+        ("import sb3_flowpolicy", ["torch", "stable_baselines3", "numpy"]),
+        (
+            "import flowpolicy_envs",
+            ["torch", "stable_baselines3", "sb3_flowpolicy", "pygame", "numba"],
+        ),
+        ("import sb3_flowpolicy.distributions", ["stable_baselines3", "gymnasium"]),
+    ],
+)
+def test_imports_stay_light(statement: str, unwanted: list[str]) -> None:
+    code = f"{statement}; import sys; print([m for m in {unwanted} if m in sys.modules])"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
+def test_public_names_resolve() -> None:
+    import sb3_flowpolicy
+
+    for name in sb3_flowpolicy.__all__:
+        assert getattr(sb3_flowpolicy, name).__name__ == name
+    assert set(sb3_flowpolicy.__all__) <= set(dir(sb3_flowpolicy))
+    with pytest.raises(AttributeError, match="has no attribute 'NoPolicy'"):
+        sb3_flowpolicy.NoPolicy  # noqa: B018

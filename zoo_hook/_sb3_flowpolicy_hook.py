@@ -1,0 +1,91 @@
+"""Start-up hook that makes `python -m rl_zoo3.train --algo sac_flow` work as typed.
+
+rl_zoo3 fixes the choices of `--algo` while it is being imported and has no entry points, so a
+plug-in has to be there first. A `.pth` line calls `install` whenever Python starts; what it
+installs waits for rl_zoo3 and then calls `sb3_flowpolicy.zoo.plug_in`.
+
+Every Python process of the environment runs this file. It therefore imports only what the
+interpreter has already loaded by then, annotates with builtins only, and never lets an error of
+ours reach the user's program. `SB3_FLOWPOLICY_NO_ZOO_HOOK=1` switches it off.
+"""
+
+import os
+import sys
+
+OFF_SWITCH = "SB3_FLOWPOLICY_NO_ZOO_HOOK"
+TARGETS = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager")
+
+
+class ZooFinder:
+    """Meta-path finder that lets the other finders find and notices when a target has run."""
+
+    def __init__(self):
+        self.waiting = set(TARGETS)
+
+    def find_spec(self, name, path=None, target=None):
+        """Return the other finders' spec for a target, with its loader wrapped."""
+        if name not in self.waiting:
+            return None
+        # Another finder may also ask everybody else: it must not get us again.
+        self.waiting.remove(name)
+        try:
+            spec = self._ask_others(name, path, target)
+        finally:
+            self.waiting.add(name)
+        if hasattr(getattr(spec, "loader", None), "exec_module"):
+            spec.loader = NotifyingLoader(spec.loader, self.plug_in)
+        return spec
+
+    def _ask_others(self, name, path, target):
+        for finder in list(sys.meta_path):
+            if finder is self or not hasattr(finder, "find_spec"):
+                continue
+            spec = finder.find_spec(name, path, target)
+            if spec is not None:
+                return spec
+        return None
+
+    def plug_in(self, module):
+        """Hand a freshly run target to `sb3_flowpolicy.zoo`; leave when there is nothing to do."""
+        self.waiting.discard(module.__name__)
+        try:
+            from sb3_flowpolicy.zoo import plug_in
+
+            plug_in(module)
+        except Exception as error:
+            # rl_zoo3 has to keep working without us. One warning is enough.
+            self.waiting.clear()
+            import warnings
+
+            warnings.warn(
+                f"sb3_flowpolicy could not register with rl_zoo3: {error!r}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        if not self.waiting and self in sys.meta_path:
+            sys.meta_path.remove(self)
+
+
+class NotifyingLoader:
+    """Loader that behaves like the wrapped one and calls `notify(module)` after it ran."""
+
+    def __init__(self, loader, notify):
+        self.loader = loader
+        self.notify = notify
+
+    def __getattr__(self, name):
+        return getattr(self.loader, name)
+
+    def exec_module(self, module):
+        """Run the module, which gets to see its real loader only, then notify."""
+        module.__spec__.loader = module.__loader__ = self.loader
+        self.loader.exec_module(module)
+        self.notify(module)
+
+
+def install():
+    """Put a `ZooFinder` first on the meta path, once, unless the environment says no."""
+    if os.environ.get(OFF_SWITCH, "0") not in ("", "0"):
+        return
+    if not any(isinstance(finder, ZooFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, ZooFinder())

@@ -1,0 +1,1 @@
+"""Hyperparameter files for rl_zoo3, one per algorithm."""
