@@ -181,6 +181,34 @@ def test_actions_are_clipped(action):
     assert np.array_equal(clipped.step([1.0, -1.0])[0], beyond.step(action)[0])
 
 
+@pytest.mark.parametrize("dims", [{"coupled_dims": 1}, {"coupled_dims": 2}])
+def test_the_far_end_of_the_tunnel_is_open(dims):
+    """No corner to hide in: backing out of the world is leaving the tunnel."""
+    env = TunnelEnv(**dims)
+    back = -np.eye(2)[0] if dims["coupled_dims"] == 1 else -np.ones(2)
+    for _ in range(7):
+        _, reward, terminated, _, _ = env.step(back)
+        assert (reward, terminated) == (0.0, False)
+    observation, reward, terminated, _, info = env.step(back)
+    assert (reward, terminated, info["is_success"]) == (-0.1, True, False)
+    assert env.observation_space.contains(observation)
+
+
+def test_free_dimensions_end_in_walls():
+    env = TunnelEnv(total_dims=3, coupled_dims=1, free_dims=1, reach=1.5)
+    observation, _, terminated, _, _ = env.step([0.0, 0.0, -1.0])
+    assert not terminated
+    assert observation.tolist() == [0.0, 0.0, -1.0]
+
+
+def test_the_goal_may_be_passed_beyond_the_world():
+    env = TunnelEnv(reach=0.8)
+    env.step([1.0, 1.0])
+    observation, reward, terminated, _, info = env.step([1.0, 1.0])
+    assert (reward, terminated, info["is_success"]) == (1.0, True, True)
+    assert observation.tolist() == [1.0, 1.0]
+
+
 def test_bad_actions_are_rejected_and_change_nothing():
     env = TunnelEnv()
     env.step([0.5, 0.5])

@@ -20,9 +20,11 @@ class TunnelEnv(gym.Env[np.ndarray, np.ndarray]):
     An agent lives in the world $[-1, 1]^D$ and has to reach a goal region without leaving a
     tunnel of width $w$. There is no inertia: from position $p$, the action $a$ leads to
 
-    $$p' = \mathrm{clip}(p + r\,a,\ -1,\ 1)$$
+    $$p' = p + r\,a$$
 
     where $r$ is the reach. Only $p'$ has to lie in the tunnel; what lies between does not count.
+    The tunnel ends where the world does: stepping out of the world is leaving the tunnel, unless
+    it is through the goal region. Free dimensions end in walls.
     As $r$ is larger than $w$, long steps stay inside only if their coordinates fit each other.
     How many do is set by the path:
 

@@ -105,6 +105,16 @@ def locate(
 
 
 @njit(cache=True)
+def _is_outside(kind: int, numbers: FloatArray, position: FloatArray) -> bool:
+    """Whether `position` (D,) has left the world along a dimension that is not free."""
+    bound = int(numbers[1]) if kind == LINE else position.shape[0]
+    for j in range(bound):
+        if abs(position[j]) > 1.0 + TOLERANCE:
+            return True
+    return False
+
+
+@njit(cache=True)
 def _observe(kind: int, numbers: FloatArray, position: FloatArray, out: np.ndarray) -> None:
     dims = position.shape[0]
     for j in range(dims):
@@ -173,10 +183,14 @@ def step_batch(
         if not active[i]:
             continue
         for j in range(dims):
-            action = min(max(actions[i, j], -1.0), 1.0)
-            positions[i, j] = min(max(positions[i, j] + reach * action, -1.0), 1.0)
+            positions[i, j] += reach * min(max(actions[i, j], -1.0), 1.0)
         offset, left = locate(kind, numbers, table, positions[i])
-        if offset > half_width + TOLERANCE:
+        # The far end of the tunnel is open: a wall there would be a place to hide in, where any
+        # action is safe. Beyond the goal there is nothing to hide from.
+        outside = left > TOLERANCE and _is_outside(kind, numbers, positions[i])
+        for j in range(dims):
+            positions[i, j] = min(max(positions[i, j], -1.0), 1.0)
+        if outside or offset > half_width + TOLERANCE:
             # No progress is paid here: otherwise leaping ahead out of the tunnel would pay off.
             rewards[i] -= leave_penalty
             terminated[i] = True

@@ -1,0 +1,199 @@
+"""The engine: takes SAC models over, updates them, and hands them back."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import torch as th
+from stable_baselines3.common.policies import ContinuousCritic
+from torch import nn
+
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
+from sb3_flowpolicy.engine.flat import FlatParameters
+from sb3_flowpolicy.engine.networks import StackedNetworks
+from sb3_flowpolicy.engine.replay import sample_transitions
+from sb3_flowpolicy.engine.update import (
+    Batch,
+    Losses,
+    Moments,
+    TrainState,
+    UpdateSettings,
+    make_update,
+)
+from sb3_flowpolicy.policies import FlowActor
+
+if TYPE_CHECKING:
+    from sb3_flowpolicy.sac_flow import SACFlow
+
+
+def why_unsupported(model: SACFlow) -> str | None:
+    """Say what about a model the engine cannot do; None if it can do everything."""
+    policy = model.policy
+    if not isinstance(policy.actor, FlowActor):
+        return f"actor of type {type(policy.actor).__name__}"
+    if type(policy.critic) is not ContinuousCritic:
+        return f"critic of type {type(policy.critic).__name__}"
+    if not isinstance(model.observation_space.shape, tuple) or model.observation_space.shape == ():
+        return f"observation space {model.observation_space}"
+    if any(True for _ in policy.critic_target.features_extractor.parameters()):
+        return "features extractor with parameters"
+    for module in policy.modules():
+        if isinstance(module, nn.modules.batchnorm._BatchNorm | nn.modules.dropout._DropoutNd):
+            return f"layer of type {type(module).__name__}"
+    for optimizer in (policy.actor.optimizer, policy.critic.optimizer):
+        if adam_settings(optimizer) is None:
+            return f"optimizer of type {type(optimizer).__name__} with these settings"
+    return None
+
+
+class Engine:
+    """Updates S models in lockstep. Their modules and optimisers become views of its tensors.
+
+    Args:
+        models: S models that differ in nothing but weights, data and random numbers.
+        compiled: Whether to compile the update. Where no compiler works, it runs eagerly, with
+            one warning and the same numbers.
+        verbose: Whether to say that it compiles, and how long it took.
+    """
+
+    def __init__(self, models: Sequence[SACFlow], compiled: bool, verbose: bool = False) -> None:
+        self.models = list(models)
+        self.compiled = compiled
+        self.verbose = verbose
+        first = self.models[0]
+        self.networks = StackedNetworks([model.policy for model in self.models])
+        self.actor_adam = FlatAdam(
+            self.networks.actor, [model.policy.actor.optimizer for model in self.models]
+        )
+        self.critic_adam = FlatAdam(
+            self.networks.critic, [model.policy.critic.optimizer for model in self.models]
+        )
+        self.temperature: FlatParameters | None = None
+        self.ent_coef_adam: FlatAdam | None = None
+        if first.ent_coef_optimizer is not None:
+            # Not a module's parameter, but owned by an optimiser all the same.
+            self.temperature = FlatParameters(
+                [{"log_ent_coef": [model.log_ent_coef]} for model in self.models]  # type: ignore[list-item]
+            )
+            optimizers = [model.ent_coef_optimizer for model in self.models]
+            self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
+        settings = UpdateSettings(
+            tau=first.tau,
+            critic_loss_coef=first.critic_loss_coef,
+            target_entropy=float(first.target_entropy),
+            actor_adam=self.actor_adam.settings,
+            critic_adam=self.critic_adam.settings,
+            ent_coef_adam=None if self.ent_coef_adam is None else self.ent_coef_adam.settings,
+        )
+        self._eager = make_update(self.networks, settings)
+        self._update: Callable[..., Losses] = self._eager
+
+    def _parts(self) -> list[FlatParameters | FlatAdam]:
+        parts = [self.networks.actor, self.networks.critic, self.networks.target]
+        return [
+            *(part for part in (*parts, self.temperature) if part is not None),
+            self.actor_adam,
+            self.critic_adam,
+            *([self.ent_coef_adam] if self.ent_coef_adam is not None else []),
+        ]
+
+    def synchronize(self) -> None:
+        """Take over what was loaded or moved since the last update."""
+        if not all(part.is_bound() for part in self._parts()):
+            for part in self._parts():
+                part.bind()
+
+    def release(self) -> None:
+        """Give modules and optimisers memory of their own; the engine must not be used again."""
+        for part in self._parts():
+            part.release()
+
+    def state(self) -> TrainState:
+        """Return the tensors that an update changes."""
+
+        def moments(adam: FlatAdam) -> Moments:
+            return Moments(adam.mean, adam.square, adam.step)
+
+        if self.temperature is not None:
+            temperature = self.temperature.data
+        else:
+            temperature = th.stack([model.ent_coef_tensor.reshape(1) for model in self.models])
+        return TrainState(
+            self.networks.actor.data,
+            self.networks.critic.data,
+            self.networks.target.data,
+            temperature,
+            moments(self.actor_adam),
+            moments(self.critic_adam),
+            None if self.ent_coef_adam is None else moments(self.ent_coef_adam),
+        )
+
+    def draw(self, n_updates: int, batch_size: int) -> list[Batch]:
+        """Draw minibatches and noise for ``n_updates`` updates at once."""
+        columns = []
+        for model in self.models:
+            assert model.replay_buffer is not None
+            sampled = sample_transitions(
+                model.replay_buffer,
+                n_updates * batch_size,
+                model.gamma,
+                model.get_vec_normalize_env(),
+            )
+            columns.append([part.unflatten(0, (n_updates, batch_size)) for part in sampled])
+        stacked = [th.stack(parts, dim=1) for parts in zip(*columns, strict=True)]
+        shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
+        data = self.networks.actor.data
+        noise = th.randn(shape, dtype=data.dtype, device=data.device)
+        return [Batch(*(part[k] for part in stacked), noise[k]) for k in range(n_updates)]
+
+    def train(self, n_updates: int, batch_size: int) -> Losses:
+        """Perform updates of all models.
+
+        Args:
+            n_updates: Number of updates, at least 1.
+            batch_size: Transitions per update and model.
+
+        Returns:
+            Means over the updates, per model.
+        """
+        self.synchronize()
+        first = self.models[0]
+        rate = first.policy.actor.optimizer.param_groups[0]["lr"]
+        learning_rate = th.tensor(rate, dtype=th.float64, device=self.networks.actor.data.device)
+        state = self.state()
+        history = []
+        for k, batch in enumerate(self.draw(n_updates, batch_size)):
+            move_target = k % first.target_update_interval == 0
+            history.append(self._call(state, batch, learning_rate, move_target))
+        return Losses(*(th.stack(parts).mean(0) for parts in zip(*history, strict=True)))
+
+    def _call(self, *arguments: object) -> Losses:
+        if not self.compiled or self._update is not self._eager:
+            return self._update(*arguments)
+        return self._compile_and_call(*arguments)
+
+    def _compile_and_call(self, *arguments: object) -> Losses:
+        """Call for the first time: compiling happens here, and fails here if it does."""
+        from sb3_flowpolicy.engine.compiling import compile_update
+
+        if self.verbose:
+            print("Compiling the SAC update ...", flush=True)
+        start = time.perf_counter()
+        self._update = compile_update(self._eager)
+        try:
+            losses = self._update(*arguments)
+        except th._dynamo.exc.TorchDynamoException as error:
+            warnings.warn(
+                "The SAC update could not be compiled and runs eagerly: same numbers, slower. "
+                f"({type(error).__name__}: {str(error).strip().splitlines()[0]})",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            self.compiled, self._update = False, self._eager
+            return self._update(*arguments)
+        if self.verbose:
+            print(f"Compiled in {time.perf_counter() - start:.1f} s", flush=True)
+        return losses

@@ -1,0 +1,85 @@
+"""All parameters of a network, or of the same network of S seeds, in one tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch as th
+from torch import nn
+
+# Entry name -> its parameters, one per copy; several copies are stacked along a leading axis.
+Layout = Mapping[str, Sequence[nn.Parameter]]
+
+
+class FlatParameters:
+    """One tensor (S, P) of which the parameters of S equal networks become views.
+
+    An optimiser step, a target update or a gradient is then one operation, not one per parameter,
+    and modules, SB3's checkpoints and ``torch.optim`` go on seeing ordinary parameters.
+
+    Args:
+        layouts: Per seed, entry name -> parameters. An entry with several parameters (the same
+            weight of each of C critics) is presented as one tensor with a leading axis C.
+
+    Example:
+        >>> import torch as th
+        >>> linear = th.nn.Linear(2, 1)
+        >>> flat = FlatParameters([{"weight": [linear.weight], "bias": [linear.bias]}])
+        >>> _ = flat.data.zero_()
+        >>> linear.weight
+        Parameter containing:
+        tensor([[0., 0.]], requires_grad=True)
+    """
+
+    def __init__(self, layouts: Sequence[Layout]) -> None:
+        self.layouts = [{name: list(parts) for name, parts in one.items()} for one in layouts]
+        first = self.layouts[0]
+        self.names = list(first)
+        self.shapes = [
+            (len(parts), *parts[0].shape) if len(parts) > 1 else tuple(parts[0].shape)
+            for parts in first.values()
+        ]
+        self.sizes = [sum(part.numel() for part in parts) for parts in first.values()]
+        self.bind()
+
+    def _owners(self, seed: int) -> list[nn.Parameter]:
+        return [part for parts in self.layouts[seed].values() for part in parts]
+
+    def views(self, flat: th.Tensor, seed: int) -> list[tuple[nn.Parameter, th.Tensor]]:
+        """Pair each parameter of a seed with its part of ``flat`` (S, P), in its own shape."""
+        owners = self._owners(seed)
+        parts = flat[seed].split([owner.numel() for owner in owners])
+        return [(owner, part.view(owner.shape)) for owner, part in zip(owners, parts, strict=True)]
+
+    def bind(self) -> None:
+        """Gather the parameters' present values and make them views of :attr:`data`."""
+        seeds = range(len(self.layouts))
+        self.data = th.stack(
+            [th.cat([owner.detach().flatten() for owner in self._owners(seed)]) for seed in seeds]
+        )
+        for seed in seeds:
+            for owner, view in self.views(self.data, seed):
+                owner.data = view
+
+    def is_bound(self) -> bool:
+        """Whether the parameters still are views: moving or reassigning a module undoes it."""
+        return all(
+            owner.data_ptr() == view.data_ptr()
+            for seed in range(len(self.layouts))
+            for owner, view in self.views(self.data, seed)
+        )
+
+    def release(self) -> None:
+        """Give every parameter memory of its own again."""
+        for seed in range(len(self.layouts)):
+            for owner, view in self.views(self.data, seed):
+                owner.data = view.clone()
+
+    def unflatten(self, flat: th.Tensor) -> dict[str, th.Tensor]:
+        """Split (..., P) into named tensors (..., \\*shape), without copying."""
+        parts = flat.split(self.sizes, dim=-1)
+        return {
+            name: part.unflatten(-1, shape) if len(shape) != 1 else part
+            for name, part, shape in zip(self.names, parts, self.shapes, strict=True)
+        }
+

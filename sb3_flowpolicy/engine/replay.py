@@ -1,0 +1,67 @@
+"""Minibatches for many updates at once, gathered straight from SB3's replay buffer."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+
+def sample_transitions(
+    buffer: ReplayBuffer, n: int, gamma: float, env: VecNormalize | None = None
+) -> tuple[th.Tensor, ...]:
+    """Draw ``n`` transitions, with the random numbers that SB3's own sampling would take.
+
+    A plain buffer on the CPU is read through tensors that share its memory, one gather per
+    column for all updates of a ``train()`` call. Any other buffer (n-step, HER, memory-saving)
+    is asked itself, once.
+
+    Args:
+        buffer: SB3's replay buffer, not empty.
+        n: Number of transitions: updates times batch size.
+        gamma: Discount factor, where the buffer does not bring its own.
+        env: ``VecNormalize`` that normalises observations and rewards.
+
+    Returns:
+        Observations, actions, next observations, dones, rewards and discounts on the buffer's
+        device, with n rows; the last three of shape (n,).
+    """
+    plain = type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage and env is None
+    if plain and buffer.device.type == "cpu":
+        return _gather(buffer, n, gamma)
+    samples: ReplayBufferSamples = buffer.sample(n, env=env)
+    discounts = samples.discounts
+    if discounts is None:
+        discounts = th.full_like(samples.rewards, gamma)
+    return (
+        samples.observations,
+        samples.actions,
+        samples.next_observations,
+        samples.dones.squeeze(-1),
+        samples.rewards.squeeze(-1),
+        discounts.squeeze(-1),
+    )
+
+
+def _gather(buffer: ReplayBuffer, n: int, gamma: float) -> tuple[th.Tensor, ...]:
+    # SB3's buffers draw from numpy's global generator: rows first, then environments.
+    rows = np.random.randint(0, buffer.size(), size=n)  # noqa: NPY002
+    if buffer.n_envs > 1:
+        rows = rows * buffer.n_envs + np.random.randint(0, buffer.n_envs, size=n)  # noqa: NPY002
+    index = th.from_numpy(rows)
+
+    def take(array: np.ndarray) -> th.Tensor:
+        return th.from_numpy(array).flatten(0, 1).index_select(0, index)
+
+    # A time limit is no end of the world: its value is bootstrapped.
+    dones = take(buffer.dones) * (1 - take(buffer.timeouts))
+    return (
+        take(buffer.observations),
+        take(buffer.actions),
+        take(buffer.next_observations),
+        dones,
+        take(buffer.rewards),
+        th.full_like(dones, gamma),
+    )

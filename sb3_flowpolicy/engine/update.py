@@ -1,0 +1,156 @@
+"""One SAC update, written once: eager, compiled, for one seed or S of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch as th
+
+from sb3_flowpolicy.engine.adam import AdamSettings, adam_step
+from sb3_flowpolicy.engine.networks import StackedNetworks
+
+
+class Moments(NamedTuple):
+    """State of one Adam: first and second moments (S, P) and step counts (S, 1)."""
+
+    mean: th.Tensor
+    square: th.Tensor
+    step: th.Tensor
+
+
+class TrainState(NamedTuple):
+    """Everything an update changes; all of it is written in place."""
+
+    actor: th.Tensor
+    critic: th.Tensor
+    target: th.Tensor
+    temperature: th.Tensor  # (S, 1): log of the entropy coefficient if learned, else itself
+    actor_moments: Moments
+    critic_moments: Moments
+    ent_coef_moments: Moments | None  # None: the temperature is fixed
+
+
+class Batch(NamedTuple):
+    """One minibatch per seed, and the noise to sample actions with."""
+
+    obs: th.Tensor  # (S, B, ...)
+    actions: th.Tensor  # (S, B, D)
+    next_obs: th.Tensor  # (S, B, ...)
+    dones: th.Tensor  # (S, B)
+    rewards: th.Tensor  # (S, B)
+    discounts: th.Tensor  # (S, B)
+    noise: th.Tensor  # (2, S, B, M): for the current and for the next observations
+
+
+class Losses(NamedTuple):
+    """What SB3 logs, per seed: each (S,)."""
+
+    ent_coef: th.Tensor
+    ent_coef_loss: th.Tensor
+    critic_loss: th.Tensor
+    actor_loss: th.Tensor
+
+
+@dataclass(frozen=True)
+class UpdateSettings:
+    """Constants of an update: they are compiled into it."""
+
+    tau: float
+    critic_loss_coef: float
+    target_entropy: float
+    actor_adam: AdamSettings
+    critic_adam: AdamSettings
+    ent_coef_adam: AdamSettings | None  # None: the temperature is fixed
+
+
+def make_update(
+    networks: StackedNetworks, settings: UpdateSettings
+) -> Callable[[TrainState, Batch, th.Tensor, bool], Losses]:
+    r"""Return the function that performs one update of all seeds, in place.
+
+    It is SB3's ``SAC.train``, in its order: temperature, critics, actor, target networks.
+
+    .. math::
+        y &= r + \gamma (1 - d) (\min_c Q_c^{target}(s', a') - \alpha \log \pi(a' | s')) \\
+        L_Q &= k \sum_c \mathrm{mean} (Q_c(s, a) - y)^2 \\
+        L_\pi &= \mathrm{mean} (\alpha \log \pi(\tilde a | s) - \min_c Q_c(s, \tilde a))
+
+    Args:
+        networks: The networks of S seeds.
+        settings: Constants of the update.
+
+    Returns:
+        Function of (state, batch, learning rate, whether to move the target networks).
+
+    References:
+        Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.
+    """
+
+    def update(
+        state: TrainState, batch: Batch, learning_rate: th.Tensor, move_target: bool
+    ) -> Losses:
+        actor = state.actor.detach().requires_grad_()
+        actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
+
+        # The temperature in force is the one before its own step.
+        if settings.ent_coef_adam is None:
+            ent_coef = state.temperature
+            ent_coef_loss = th.zeros_like(ent_coef)
+        else:
+            ent_coef = state.temperature.exp()
+            # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
+            surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
+            ent_coef_loss = -(state.temperature * surplus)
+            assert state.ent_coef_moments is not None
+            moments = state.ent_coef_moments
+            stepped = adam_step(
+                state.temperature, -surplus, *moments, learning_rate, settings.ent_coef_adam
+            )
+            for old, new in zip((state.temperature, *moments), stepped, strict=True):
+                old.copy_(new)
+
+        with th.no_grad():
+            next_actions, next_log_prob = networks.sample(
+                state.actor, batch.next_obs, batch.noise[1]
+            )
+            next_q = networks.q_values(state.target, batch.next_obs, next_actions).amin(1)
+            next_value = next_q - ent_coef * next_log_prob
+            target_q = batch.rewards + (1 - batch.dones) * batch.discounts * next_value
+
+        critic = state.critic.detach().requires_grad_()
+        current_q = networks.q_values(critic, batch.obs, batch.actions)
+        errors = current_q - target_q.unsqueeze(1)
+        critic_loss = settings.critic_loss_coef * errors.square().mean(-1).sum(1)
+        # Seeds do not share parameters: the gradient of the sum is each seed's own.
+        (gradient,) = th.autograd.grad(critic_loss.sum(), critic)
+        new_critic, *critic_moments = adam_step(
+            state.critic, gradient, *state.critic_moments, learning_rate, settings.critic_adam
+        )
+
+        q_pi = networks.q_values(new_critic, batch.obs, actions_pi).amin(1)
+        actor_loss = (ent_coef * log_prob - q_pi).mean(-1)
+        (gradient,) = th.autograd.grad(actor_loss.sum(), actor)
+        new_actor, *actor_moments = adam_step(
+            state.actor, gradient, *state.actor_moments, learning_rate, settings.actor_adam
+        )
+
+        if move_target:
+            state.target.lerp_(new_critic, settings.tau)
+        state.critic.copy_(new_critic)
+        state.actor.copy_(new_actor)
+        for olds, news in (
+            (state.critic_moments, critic_moments),
+            (state.actor_moments, actor_moments),
+        ):
+            for old, new in zip(olds, news, strict=True):
+                old.copy_(new)
+        return Losses(
+            ent_coef.squeeze(-1),
+            ent_coef_loss.squeeze(-1),
+            critic_loss.detach(),
+            actor_loss.detach(),
+        )
+
+    return update
