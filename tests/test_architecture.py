@@ -11,7 +11,15 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A package may import those before it, and nothing after.
-FLOORS = ["distributions", "policies", "demonstrations", "sac_flow", "diagnostics", "zoo"]
+FLOORS = [
+    "distributions",
+    "policies",
+    "engine",
+    "demonstrations",
+    "sac_flow",
+    "diagnostics",
+    "zoo",
+]
 THIRD_PARTY = {
     "distributions": {"torch"},
     "policies": {"torch", "numpy", "gymnasium", "stable_baselines3"},

@@ -1,23 +1,59 @@
-"""How the update is compiled."""
+"""How the update is compiled, and what happens where it cannot be."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import time
+import warnings
 
 import torch as th
 
+from sb3_flowpolicy.engine.update import Batch, Losses, TrainState, Update
 
-def compile_update(update: Callable[..., Any]) -> Callable[..., Any]:
+
+def compile_update(update: Update, verbose: bool = False) -> Update:
     """Compile an update into one graph: gradients, optimisers and target networks included.
 
-    Compilation itself happens at the first call, and is cached on disk across runs by torch.
+    Compilation happens at the first call, and torch caches it on disk across runs. Where it
+    fails, for want of a C++ compiler say, the update runs eagerly ever after.
+
+    Args:
+        update: The update of :func:`~sb3_flowpolicy.engine.update.make_update`.
+        verbose: Whether to say that it compiles, and how long it took.
+
+    Returns:
+        A function that does the same.
     """
     compiled = th.compile(update, fullgraph=True, dynamic=False)
+    known: set[bool] = set()
+    broken = False
 
-    def call(*arguments: Any) -> Any:
-        # Lets torch.autograd.grad be traced; switched on for our graph alone.
-        with th._dynamo.config.patch(trace_autograd_ops=True):
-            return compiled(*arguments)
+    def call(
+        state: TrainState, batch: Batch, learning_rate: th.Tensor, move_target: bool
+    ) -> Losses:
+        nonlocal broken
+        if broken:
+            return update(state, batch, learning_rate, move_target)
+        if move_target not in known and verbose:
+            print("Compiling the SAC update ...", flush=True)
+        start = time.perf_counter()
+        try:
+            # Lets torch.autograd.grad be traced; switched on for our graph alone.
+            with th._dynamo.config.patch(trace_autograd_ops=True):
+                losses = compiled(state, batch, learning_rate, move_target)
+        except (th._dynamo.exc.TorchDynamoException, th._inductor.exc.InductorError) as error:
+            broken = True
+            reason = str(error).strip().splitlines()[0]
+            warnings.warn(
+                "the SAC update could not be compiled and runs eagerly: the same numbers, only "
+                f"slower ({type(error).__name__}: {reason})",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            return update(state, batch, learning_rate, move_target)
+        if move_target not in known:
+            known.add(move_target)
+            if verbose:
+                print(f"Compiled in {time.perf_counter() - start:.1f} s", flush=True)
+        return losses
 
     return call

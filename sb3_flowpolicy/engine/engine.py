@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import time
-import warnings
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
+from sb3_flowpolicy.engine.compiling import compile_update
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import sample_transitions
@@ -25,11 +24,8 @@ from sb3_flowpolicy.engine.update import (
 )
 from sb3_flowpolicy.policies import FlowActor
 
-if TYPE_CHECKING:
-    from sb3_flowpolicy.sac_flow import SACFlow
 
-
-def why_unsupported(model: SACFlow) -> str | None:
+def why_unsupported(model: SAC) -> str | None:
     """Say what about a model the engine cannot do; None if it can do everything."""
     policy = model.policy
     if not isinstance(policy.actor, FlowActor):
@@ -49,20 +45,43 @@ def why_unsupported(model: SACFlow) -> str | None:
     return None
 
 
+def update_settings(model: SAC, critic_loss_coef: float) -> UpdateSettings:
+    """Read the constants of an update off a model that the engine supports."""
+    actor_adam = adam_settings(model.policy.actor.optimizer)
+    critic_adam = adam_settings(model.policy.critic.optimizer)
+    assert actor_adam is not None
+    assert critic_adam is not None
+    learned = model.ent_coef_optimizer
+    return UpdateSettings(
+        tau=model.tau,
+        critic_loss_coef=critic_loss_coef,
+        target_entropy=float(model.target_entropy),
+        actor_adam=actor_adam,
+        critic_adam=critic_adam,
+        ent_coef_adam=None if learned is None else adam_settings(learned),
+    )
+
+
 class Engine:
     """Updates S models in lockstep. Their modules and optimisers become views of its tensors.
 
     Args:
         models: S models that differ in nothing but weights, data and random numbers.
+        critic_loss_coef: Factor of the critics' summed mean squared error; 0.5 in SB3.
         compiled: Whether to compile the update. Where no compiler works, it runs eagerly, with
             one warning and the same numbers.
         verbose: Whether to say that it compiles, and how long it took.
     """
 
-    def __init__(self, models: Sequence[SACFlow], compiled: bool, verbose: bool = False) -> None:
+    def __init__(
+        self,
+        models: Sequence[SAC],
+        critic_loss_coef: float = 0.5,
+        compiled: bool = False,
+        verbose: bool = False,
+    ) -> None:
         self.models = list(models)
         self.compiled = compiled
-        self.verbose = verbose
         first = self.models[0]
         self.networks = StackedNetworks([model.policy for model in self.models])
         self.actor_adam = FlatAdam(
@@ -80,16 +99,9 @@ class Engine:
             )
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
-        settings = UpdateSettings(
-            tau=first.tau,
-            critic_loss_coef=first.critic_loss_coef,
-            target_entropy=float(first.target_entropy),
-            actor_adam=self.actor_adam.settings,
-            critic_adam=self.critic_adam.settings,
-            ent_coef_adam=None if self.ent_coef_adam is None else self.ent_coef_adam.settings,
-        )
-        self._eager = make_update(self.networks, settings)
-        self._update: Callable[..., Losses] = self._eager
+        self.settings = update_settings(first, critic_loss_coef)
+        update = make_update(self.networks, self.settings)
+        self._update = compile_update(update, verbose) if compiled else update
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
@@ -147,7 +159,7 @@ class Engine:
         shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
         data = self.networks.actor.data
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
-        return [Batch(*(part[k] for part in stacked), noise[k]) for k in range(n_updates)]
+        return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
 
     def train(self, n_updates: int, batch_size: int) -> Losses:
         """Perform updates of all models.
@@ -167,33 +179,5 @@ class Engine:
         history = []
         for k, batch in enumerate(self.draw(n_updates, batch_size)):
             move_target = k % first.target_update_interval == 0
-            history.append(self._call(state, batch, learning_rate, move_target))
+            history.append(self._update(state, batch, learning_rate, move_target))
         return Losses(*(th.stack(parts).mean(0) for parts in zip(*history, strict=True)))
-
-    def _call(self, *arguments: object) -> Losses:
-        if not self.compiled or self._update is not self._eager:
-            return self._update(*arguments)
-        return self._compile_and_call(*arguments)
-
-    def _compile_and_call(self, *arguments: object) -> Losses:
-        """Call for the first time: compiling happens here, and fails here if it does."""
-        from sb3_flowpolicy.engine.compiling import compile_update
-
-        if self.verbose:
-            print("Compiling the SAC update ...", flush=True)
-        start = time.perf_counter()
-        self._update = compile_update(self._eager)
-        try:
-            losses = self._update(*arguments)
-        except th._dynamo.exc.TorchDynamoException as error:
-            warnings.warn(
-                "The SAC update could not be compiled and runs eagerly: same numbers, slower. "
-                f"({type(error).__name__}: {str(error).strip().splitlines()[0]})",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-            self.compiled, self._update = False, self._eager
-            return self._update(*arguments)
-        if self.verbose:
-            print(f"Compiled in {time.perf_counter() - start:.1f} s", flush=True)
-        return losses

@@ -18,8 +18,9 @@ class FlatParameters:
     and modules, SB3's checkpoints and ``torch.optim`` go on seeing ordinary parameters.
 
     Args:
-        layouts: Per seed, entry name -> parameters. An entry with several parameters (the same
-            weight of each of C critics) is presented as one tensor with a leading axis C.
+        layouts: Per seed, entry name -> its copies: one parameter, or the same parameter of each
+            of C critics.
+        copies: Whether entries are presented with a leading axis C for their copies.
 
     Example:
         >>> import torch as th
@@ -31,12 +32,12 @@ class FlatParameters:
         tensor([[0., 0.]], requires_grad=True)
     """
 
-    def __init__(self, layouts: Sequence[Layout]) -> None:
+    def __init__(self, layouts: Sequence[Layout], copies: bool = False) -> None:
         self.layouts = [{name: list(parts) for name, parts in one.items()} for one in layouts]
         first = self.layouts[0]
         self.names = list(first)
         self.shapes = [
-            (len(parts), *parts[0].shape) if len(parts) > 1 else tuple(parts[0].shape)
+            (len(parts), *parts[0].shape) if copies else tuple(parts[0].shape)
             for parts in first.values()
         ]
         self.sizes = [sum(part.numel() for part in parts) for parts in first.values()]
@@ -76,10 +77,9 @@ class FlatParameters:
                 owner.data = view.clone()
 
     def unflatten(self, flat: th.Tensor) -> dict[str, th.Tensor]:
-        """Split (..., P) into named tensors (..., \\*shape), without copying."""
+        """Split (S, P) into named tensors of shape (S, *shape), without copying."""
         parts = flat.split(self.sizes, dim=-1)
         return {
             name: part.unflatten(-1, shape) if len(shape) != 1 else part
             for name, part, shape in zip(self.names, parts, self.shapes, strict=True)
         }
-

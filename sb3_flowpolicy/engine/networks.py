@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
@@ -38,21 +37,13 @@ class StackedNetworks:
         assert isinstance(first.actor, FlowActor)
         self.n_seeds = len(policies)
         self.actor = FlatParameters([_actor_layout(policy) for policy in policies])
-        self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies])
-        self.target = FlatParameters([_critic_layout(policy.critic_target) for policy in policies])
+        self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies], True)
+        self.target = FlatParameters(
+            [_critic_layout(policy.critic_target) for policy in policies], True
+        )
         self.noise_dim = first.actor.density.noise_dim
         self._sampler = _ActionLogProb(first.actor)
         self._critic = first.critic
-        self._q_network = first.critic.q_networks[0]
-
-    def release(self) -> None:
-        """Give all modules memory of their own again."""
-        for flat in (self.actor, self.critic, self.target):
-            flat.release()
-
-    def is_bound(self) -> bool:
-        """Whether all modules still are views of the flat tensors."""
-        return all(flat.is_bound() for flat in (self.actor, self.critic, self.target))
 
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
@@ -67,14 +58,21 @@ class StackedNetworks:
         Returns:
             Actions (S, B, D) and log-probabilities (S, B).
         """
+        parameters = self.actor.unflatten(actor)
+        if self.n_seeds > 1:
+            return vmap(self._sample_one)(parameters, obs, noise)
+        # One seed takes no detour: vmap over a single one would turn products into batched ones.
+        single = {name: value.squeeze(0) for name, value in parameters.items()}
+        actions, log_prob = self._sample_one(single, obs.squeeze(0), noise.squeeze(0))
+        return actions.unsqueeze(0), log_prob.unsqueeze(0)
 
-        def one(parameters: dict[str, th.Tensor], obs: th.Tensor, noise: th.Tensor) -> Any:
-            return functional_call(self._sampler, parameters, (obs, noise))
-
-        return self._over_seeds(one, self.actor.unflatten(actor), obs, noise)
+    def _sample_one(
+        self, parameters: dict[str, th.Tensor], obs: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        return functional_call(self._sampler, parameters, (obs, noise))
 
     def q_values(self, critic: th.Tensor, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Evaluate all critics.
+        """Evaluate all critics of all seeds: each layer is one batched product.
 
         Args:
             critic: Flat parameters of critics or target critics, (S, P).
@@ -84,29 +82,18 @@ class StackedNetworks:
         Returns:
             Values, (S, C, B).
         """
-
-        def one(parameters: dict[str, th.Tensor], obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-            features = self._critic.extract_features(obs, self._critic.features_extractor)
-            inputs = th.cat([features, actions], dim=1)
-
-            def one_critic(parameters: dict[str, th.Tensor]) -> th.Tensor:
-                return functional_call(self._q_network, parameters, (inputs,))
-
-            if self._critic.n_critics == 1:
-                return one_critic(parameters).mT
-            return vmap(one_critic)(parameters).squeeze(-1)
-
-        return self._over_seeds(one, self.critic.unflatten(critic), obs, actions)
-
-    def _over_seeds(self, function: Any, parameters: dict[str, th.Tensor], *inputs: th.Tensor) -> Any:
-        if self.n_seeds > 1:
-            return vmap(function)(parameters, *inputs)
-        # One seed takes no detour: vmap over a single one would turn products into batched ones.
-        single = {name: value.squeeze(0) for name, value in parameters.items()}
-        result = function(single, *(value.squeeze(0) for value in inputs))
-        if isinstance(result, tuple):
-            return tuple(value.unsqueeze(0) for value in result)
-        return result.unsqueeze(0)
+        extractor = self._critic.features_extractor
+        features = self._critic.extract_features(obs.flatten(0, 1), extractor)
+        features = features.unflatten(0, obs.shape[:2])
+        hidden = th.cat([features, actions], dim=-1).unsqueeze(1)
+        parameters = self.critic.unflatten(critic)
+        for name, layer in self._critic.q_networks[0].named_children():
+            if isinstance(layer, nn.Linear):
+                weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
+                hidden = hidden @ weight.mT + bias.unsqueeze(-2)
+            else:
+                hidden = layer(hidden)
+        return hidden.squeeze(-1)
 
 
 def _actor_layout(policy: SACPolicy) -> Layout:

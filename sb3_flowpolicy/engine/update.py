@@ -52,6 +52,11 @@ class Losses(NamedTuple):
     critic_loss: th.Tensor
     actor_loss: th.Tensor
 
+    def of_seed(self, seed: int) -> dict[str, float]:
+        """Return one seed's losses as numbers, in one transfer from the device."""
+        values = th.stack([loss[seed] for loss in self]).tolist()
+        return dict(zip(self._fields, values, strict=True))
+
 
 @dataclass(frozen=True)
 class UpdateSettings:
@@ -65,9 +70,11 @@ class UpdateSettings:
     ent_coef_adam: AdamSettings | None  # None: the temperature is fixed
 
 
-def make_update(
-    networks: StackedNetworks, settings: UpdateSettings
-) -> Callable[[TrainState, Batch, th.Tensor, bool], Losses]:
+# (state, batch, learning rate, whether to move the target networks) -> losses
+Update = Callable[[TrainState, Batch, th.Tensor, bool], Losses]
+
+
+def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
     r"""Return the function that performs one update of all seeds, in place.
 
     It is SB3's ``SAC.train``, in its order: temperature, critics, actor, target networks.

@@ -1,0 +1,127 @@
+"""The engine's updates are SB3's, number by number: before speed is worth a word."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+from sb3_flowpolicy import SACFlow
+
+N_UPDATES = 20
+BATCH_SIZE = 32
+
+
+class DoubleExtractor(FlattenExtractor):
+    """SB3 casts observations to float32; here they go on in float64."""
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return super().forward(obs).double()
+
+
+class Box(gym.Env):
+    """Three observations, two actions; never stepped."""
+
+    observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
+def make(algorithm: type[SAC], policy: str, dtype: th.dtype, seed: int = 0, **settings: Any) -> SAC:
+    policy_kwargs = {"net_arch": [16, 16], **settings.pop("policy_kwargs", {})}
+    if dtype == th.float64:
+        policy_kwargs["features_extractor_class"] = DoubleExtractor
+    if algorithm is SAC:
+        policy = SACFlow.policy_aliases[policy] if policy != "MlpPolicy" else policy  # type: ignore[assignment]
+    model = algorithm(
+        policy,
+        Box(),
+        buffer_size=300,
+        seed=seed,
+        device="cpu",
+        policy_kwargs=policy_kwargs,
+        **settings,
+    )
+    model.policy.to(dtype)
+    if model.log_ent_coef is not None:
+        model.log_ent_coef.data = model.log_ent_coef.data.to(dtype)
+    model.set_logger(configure(None, []))
+    rng = np.random.default_rng(seed)
+    assert model.replay_buffer is not None
+    for step in range(300):
+        obs, next_obs = rng.uniform(-1, 1, (2, 1, 3)).astype(np.float32)
+        info = [{"TimeLimit.truncated": step % 7 == 0}]
+        done = np.array([step % 5 == 0 or step % 7 == 0])
+        action, reward = rng.uniform(-1, 1, (1, 2)), rng.normal(size=1)
+        model.replay_buffer.add(obs, next_obs, action, reward, done, info)
+    return model
+
+
+def seed_everything() -> None:
+    """The engine draws for all updates at once, and gets the same numbers in order."""
+    np.random.seed(1)  # noqa: NPY002 (SB3's buffers draw from the global state)
+    th.manual_seed(1)
+
+
+def everything(model: SAC) -> dict[str, th.Tensor]:
+    """Parameters, optimiser states and temperature of a model."""
+    tensors = {k: v.clone() for k, v in model.policy.state_dict().items()}
+    optimizers = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+    if model.ent_coef_optimizer is not None and model.log_ent_coef is not None:
+        optimizers["ent_coef"] = model.ent_coef_optimizer
+        tensors["log_ent_coef"] = model.log_ent_coef.detach().clone()
+    for name, optimizer in optimizers.items():
+        for i, state in optimizer.state_dict()["state"].items():
+            for key, value in state.items():
+                tensors[f"{name}.{i}.{key}"] = value.clone()
+    return tensors
+
+
+def assert_same(got: SAC, expected: SAC, dtype: th.dtype) -> None:
+    tolerance = 1e-10 if dtype == th.float64 else 1e-5
+    ours, theirs = everything(got), everything(expected)
+    assert ours.keys() == theirs.keys()
+    for key, value in theirs.items():
+        # Relative to the tensor's own size: single entries may pass through zero.
+        scale = value.abs().max().item() or 1.0
+        th.testing.assert_close(ours[key], value, rtol=tolerance, atol=tolerance * scale, msg=key)
+    for key in ("actor_loss", "critic_loss", "ent_coef"):
+        theirs_mean = expected.logger.name_to_value[f"train/{key}"]
+        assert got.logger.name_to_value[f"train/{key}"] == pytest.approx(theirs_mean, rel=1e-5), key
+
+
+def stock_loop(model: SAC, n_updates: int = N_UPDATES) -> None:
+    if isinstance(model.actor.action_dist, SquashedDiagGaussianDistribution):
+        model.actor.action_dist.epsilon = 0.0  # stock SAC adds 1e-6 inside a logarithm
+    model.train(n_updates, batch_size=BATCH_SIZE)
+
+
+@pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("ent_coef", [0.1, "auto"])
+@pytest.mark.parametrize("weight_decay", [0.0, 2.5e-4])
+@pytest.mark.parametrize("policy", ["MlpPolicy", "LowRankPolicy", "FlowPolicy"])
+def test_eager_engine_equals_sb3(
+    policy: str,
+    weight_decay: float,
+    ent_coef: Any,
+    dtype: th.dtype,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """For "MlpPolicy" the peer is untouched SB3, for the others SB3's loop with our policy."""
+    ours_policy = "GaussPolicy" if policy == "MlpPolicy" else policy
+    optimizer_kwargs = {"weight_decay": weight_decay}
+    settings = {"ent_coef": ent_coef, "policy_kwargs": {"optimizer_kwargs": optimizer_kwargs}}
+    stock = make(SAC, policy, dtype, **settings)
+    ours = make(SACFlow, ours_policy, dtype, compile=False, **settings)
+    ours.policy.load_state_dict(stock.policy.state_dict())
+    seed_everything()
+    stock_loop(stock)
+    seed_everything()
+    ours.train(N_UPDATES, batch_size=BATCH_SIZE)
+    assert_same(ours, stock, dtype)
