@@ -200,7 +200,7 @@ class SACFlow(SAC):
                 stacklevel=3,
             )
             return None
-        self._engine = Engine([self], self.critic_loss_coef, compiled, verbose=self.verbose > 0)
+        self._engine = Engine([self], self.critic_loss_coef, compiled)
         return self._engine
 
     def _train_with_sb3(self, gradient_steps: int, batch_size: int) -> None:

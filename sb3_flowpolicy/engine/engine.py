@@ -70,7 +70,6 @@ class Engine:
         critic_loss_coef: Factor of the critics' summed mean squared error; 0.5 in SB3.
         compiled: Whether to compile the update. Where no compiler works, it runs eagerly, with
             one warning and the same numbers.
-        verbose: Whether to say that it compiles, and how long it took.
     """
 
     def __init__(
@@ -78,7 +77,6 @@ class Engine:
         models: Sequence[SAC],
         critic_loss_coef: float = 0.5,
         compiled: bool = False,
-        verbose: bool = False,
     ) -> None:
         self.models = list(models)
         self.compiled = compiled
@@ -101,7 +99,7 @@ class Engine:
             self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
         self.settings = update_settings(first, critic_loss_coef)
         update = make_update(self.networks, self.settings)
-        self._update = compile_update(update, verbose) if compiled else update
+        self._update = compile_update(update) if compiled else update
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]

@@ -3,7 +3,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs import registration
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import iterate
 
@@ -53,9 +52,9 @@ def assert_same(ours: Any, theirs: Any) -> None:
 @pytest.fixture
 def gymnasiums_own_time_limit(monkeypatch):
     """rl_zoo3 puts a time limit of its own into gymnasium, once any test has imported it."""
-    classes = registration.TimeLimit.__mro__
+    classes = gym.wrappers.TimeLimit.__mro__
     own = next(c for c in classes if c.__module__.startswith("gymnasium."))
-    monkeypatch.setattr(registration, "TimeLimit", own)
+    monkeypatch.setattr(gym.wrappers, "TimeLimit", own)
 
 
 @pytest.mark.usefixtures("gymnasiums_own_time_limit")

@@ -108,10 +108,10 @@ def locate(
 def _is_outside(kind: int, numbers: FloatArray, position: FloatArray) -> bool:
     """Whether `position` (D,) has left the world along a dimension that is not free."""
     bound = int(numbers[1]) if kind == LINE else position.shape[0]
+    farthest = 0.0
     for j in range(bound):
-        if abs(position[j]) > 1.0 + TOLERANCE:
-            return True
-    return False
+        farthest = max(farthest, abs(position[j]))
+    return farthest > 1.0 + TOLERANCE
 
 
 @njit(cache=True)
