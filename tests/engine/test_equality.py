@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +16,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy.engine import Engine
+from sb3_flowpolicy.engine.update import Batch
 
 N_UPDATES = 20
 BATCH_SIZE = 32
@@ -83,14 +87,17 @@ def everything(model: SAC) -> dict[str, th.Tensor]:
     return tensors
 
 
-def assert_same(got: SAC, expected: SAC, dtype: th.dtype) -> None:
+def assert_close(ours: dict[str, th.Tensor], theirs: dict[str, th.Tensor], dtype: th.dtype) -> None:
     tolerance = 1e-10 if dtype == th.float64 else 1e-5
-    ours, theirs = everything(got), everything(expected)
     assert ours.keys() == theirs.keys()
     for key, value in theirs.items():
         # Relative to the tensor's own size: single entries may pass through zero.
         scale = value.abs().max().item() or 1.0
         th.testing.assert_close(ours[key], value, rtol=tolerance, atol=tolerance * scale, msg=key)
+
+
+def assert_same(got: SAC, expected: SAC, dtype: th.dtype) -> None:
+    assert_close(everything(got), everything(expected), dtype)
     for key in ("actor_loss", "critic_loss", "ent_coef"):
         theirs_mean = expected.logger.name_to_value[f"train/{key}"]
         assert got.logger.name_to_value[f"train/{key}"] == pytest.approx(theirs_mean, rel=1e-5), key
@@ -102,26 +109,121 @@ def stock_loop(model: SAC, n_updates: int = N_UPDATES) -> None:
     model.train(n_updates, batch_size=BATCH_SIZE)
 
 
-@pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
-@pytest.mark.parametrize("ent_coef", [0.1, "auto"])
-@pytest.mark.parametrize("weight_decay", [0.0, 2.5e-4])
-@pytest.mark.parametrize("policy", ["MlpPolicy", "LowRankPolicy", "FlowPolicy"])
-def test_eager_engine_equals_sb3(
-    policy: str,
-    weight_decay: float,
-    ent_coef: Any,
-    dtype: th.dtype,
-    monkeypatch: pytest.MonkeyPatch,
+def compare(
+    policy: str, weight_decay: float, ent_coef: Any, dtype: th.dtype, compile: bool
 ) -> None:
     """For "MlpPolicy" the peer is untouched SB3, for the others SB3's loop with our policy."""
     ours_policy = "GaussPolicy" if policy == "MlpPolicy" else policy
     optimizer_kwargs = {"weight_decay": weight_decay}
     settings = {"ent_coef": ent_coef, "policy_kwargs": {"optimizer_kwargs": optimizer_kwargs}}
     stock = make(SAC, policy, dtype, **settings)
-    ours = make(SACFlow, ours_policy, dtype, compile=False, **settings)
+    ours = make(SACFlow, ours_policy, dtype, compile=compile, **settings)
     ours.policy.load_state_dict(stock.policy.state_dict())
     seed_everything()
     stock_loop(stock)
     seed_everything()
     ours.train(N_UPDATES, batch_size=BATCH_SIZE)
     assert_same(ours, stock, dtype)
+
+
+@pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("ent_coef", [0.1, "auto"])
+@pytest.mark.parametrize("weight_decay", [0.0, 2.5e-4])
+@pytest.mark.parametrize("policy", ["MlpPolicy", "LowRankPolicy", "FlowPolicy"])
+def test_eager_engine_equals_sb3(
+    policy: str, weight_decay: float, ent_coef: Any, dtype: th.dtype
+) -> None:
+    compare(policy, weight_decay, ent_coef, dtype, compile=False)
+
+
+COMPILED = [
+    ("MlpPolicy", 2.5e-4, "auto", th.float32),
+    ("LowRankPolicy", 2.5e-4, "auto", th.float32),
+    ("FlowPolicy", 2.5e-4, "auto", th.float32),
+    ("FlowPolicy", 0.0, 0.1, th.float64),
+]
+# Compiling takes long: the rest of the matrix runs with `pytest -m slow`.
+MATRIX = [
+    pytest.param(*case, marks=[] if case in COMPILED else pytest.mark.slow)
+    for case in itertools.product(
+        ["MlpPolicy", "LowRankPolicy", "FlowPolicy"],
+        [0.0, 2.5e-4],
+        [0.1, "auto"],
+        [th.float32, th.float64],
+    )
+]
+
+
+@pytest.mark.parametrize(("policy", "weight_decay", "ent_coef", "dtype"), MATRIX)
+def test_compiled_engine_equals_sb3(
+    policy: str, weight_decay: float, ent_coef: Any, dtype: th.dtype
+) -> None:
+    compare(policy, weight_decay, ent_coef, dtype, compile=True)
+
+
+@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+@pytest.mark.parametrize("ent_coef", [0.1, "auto"])
+@pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
+def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th.dtype) -> None:
+    n_seeds = 4
+    settings = {"ent_coef": ent_coef}
+    settings["policy_kwargs"] = {"optimizer_kwargs": {"weight_decay": 2.5e-4}}
+
+    def models() -> list[SAC]:
+        return [make(SACFlow, policy, dtype, seed=seed, **settings) for seed in range(n_seeds)]
+
+    stacked = Engine(models())
+    singles = [Engine([model]) for model in models()]
+    rate = th.tensor(3e-4, dtype=th.float64)
+    np.random.seed(1)  # noqa: NPY002
+    for step, batch in enumerate(stacked.draw(N_UPDATES, BATCH_SIZE)):
+        losses = stacked._update(stacked.state(), batch, rate, step % 2 == 0)
+        for seed, single in enumerate(singles):
+            own = Batch(*(part[seed : seed + 1] for part in batch[:-1]), batch.noise[:, [seed]])
+            expected = single._update(single.state(), own, rate, step % 2 == 0).of_seed(0)
+            assert losses.of_seed(seed) == pytest.approx(expected, rel=1e-4)
+    for got, single in zip(stacked.models, singles, strict=True):
+        assert_close(everything(got), everything(single.models[0]), dtype)
+
+
+def test_loading_a_checkpoint_between_updates_is_noticed(tmp_path: Path) -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    model.train(3, batch_size=BATCH_SIZE)
+    before = everything(model)
+    model.save(tmp_path / "model")
+    model.train(3, batch_size=BATCH_SIZE)
+    assert not th.equal(everything(model)["log_ent_coef"], before["log_ent_coef"])
+    model.set_parameters(str(tmp_path / "model.zip"))
+    assert model.log_ent_coef is not None
+    model.log_ent_coef.data = before["log_ent_coef"].clone()  # not among SB3's parameters
+    seed_everything()
+    model.train(3, batch_size=BATCH_SIZE)
+    went_on = everything(model)
+    fresh = SACFlow.load(tmp_path / "model", env=Box(), device="cpu")
+    fresh.replay_buffer = model.replay_buffer
+    fresh.set_logger(configure(None, []))
+    seed_everything()
+    fresh.train(3, batch_size=BATCH_SIZE)
+    assert_close(everything(fresh), went_on, th.float32)
+
+
+def test_settings_changed_between_updates_are_noticed() -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    model.train(1, batch_size=BATCH_SIZE)
+    model.tau = 1.0
+    model.train(1, batch_size=BATCH_SIZE)
+    critic, target = model.critic.state_dict(), model.critic_target.state_dict()
+    assert all(th.equal(target[key], value) for key, value in critic.items())
+
+
+def test_released_models_own_their_memory() -> None:
+    models = [make(SACFlow, "FlowPolicy", th.float32, seed=seed) for seed in range(2)]
+    engine = Engine(models)
+    engine.train(2, BATCH_SIZE)
+    before = everything(models[0])
+    engine.release()
+    assert_close(everything(models[0]), before, th.float32)
+    with th.no_grad():
+        engine.networks.actor.data.zero_()
+        engine.actor_adam.mean.zero_()
+    assert_close(everything(models[0]), before, th.float32)
