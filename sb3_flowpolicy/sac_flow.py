@@ -158,7 +158,16 @@ class SACFlow(SAC):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         random_steps = learning_starts if self.random_steps is None else self.random_steps
-        return super()._sample_action(random_steps, action_noise, n_envs)
+        engine = self._engine
+        if self.num_timesteps < random_steps or engine is None or not engine.compiled:
+            return super()._sample_action(random_steps, action_noise, n_envs)
+        # What SB3 does, less what it spends on finding out that the observation is an array.
+        obs = th.as_tensor(self._last_obs, device=self.device)
+        scaled = engine.act(obs.unsqueeze(0)).squeeze(0).cpu().numpy()
+        scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Do ``gradient_steps`` updates with minibatches of ``batch_size`` transitions.
@@ -191,6 +200,8 @@ class SACFlow(SAC):
         settings = update_settings(self, self.critic_loss_coef) if fits else None
         if engine is not None and engine.settings == settings:
             return engine
+        if engine is not None:
+            engine.release()
         reason = why_unsupported(self)
         if reason is not None:
             self._engine_refused = True

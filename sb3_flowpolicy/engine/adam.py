@@ -47,17 +47,22 @@ class FlatAdam:
         self.settings = settings
         self.flat = flat
         self.optimizers = optimizers
-        for optimizer in optimizers:
-            # Whoever saves a checkpoint gets step counts that are up to date.
+        # Whoever saves a checkpoint gets step counts that are up to date.
+        self._hooks = [
             optimizer.register_state_dict_pre_hook(lambda _: self.publish_steps())
+            for optimizer in optimizers
+        ]
+        self._addresses: list[tuple[th.optim.Optimizer, th.Tensor, int]] = []
         self.bind()
 
     def bind(self) -> None:
         """Take over the optimisers' states and make them views of ours."""
+        self.publish_steps()
         data = self.flat.data
         self.mean, self.square = th.zeros_like(data), th.zeros_like(data)
         #: Number of steps taken, (S, 1): float64, as 1 - 0.999^t needs its digits.
         self.step = th.zeros(len(data), 1, dtype=th.float64, device=data.device)
+        self._addresses = []
         for seed, optimizer in enumerate(self.optimizers):
             pairs = zip(
                 self.flat.views(self.mean, seed), self.flat.views(self.square, seed), strict=True
@@ -69,17 +74,19 @@ class FlatAdam:
                     square.copy_(state["exp_avg_sq"])
                     self.step[seed] = float(state["step"])
                 state.update(step=th.tensor(0.0), exp_avg=mean, exp_avg_sq=square)
+                self._addresses.append((optimizer, owner, mean.data_ptr()))
 
     def is_bound(self) -> bool:
         """Whether the optimisers' states still are views: loading a checkpoint undoes it."""
-        return all(
-            optimizer.state[owner].get("exp_avg", owner).data_ptr() == mean.data_ptr()
-            for seed, optimizer in enumerate(self.optimizers)
-            for owner, mean in self.flat.views(self.mean, seed)
+        return bool(self._addresses) and all(
+            owner in optimizer.state and optimizer.state[owner]["exp_avg"].data_ptr() == address
+            for optimizer, owner, address in self._addresses
         )
 
     def publish_steps(self) -> None:
         """Write the step counts where ``torch.optim`` keeps them: one small tensor each."""
+        if not self.is_bound():
+            return  # what was loaded since is newer than what we know
         for optimizer, step in zip(self.optimizers, self.step[:, 0].tolist(), strict=True):
             for state in optimizer.state.values():
                 state["step"].fill_(step)
@@ -87,11 +94,13 @@ class FlatAdam:
     def release(self) -> None:
         """Give the optimisers memory of their own again."""
         self.publish_steps()
-        for seed, optimizer in enumerate(self.optimizers):
-            for owner, _ in self.flat.views(self.mean, seed):
-                state = optimizer.state[owner]
-                state["exp_avg"] = state["exp_avg"].clone()
-                state["exp_avg_sq"] = state["exp_avg_sq"].clone()
+        for hook in self._hooks:
+            hook.remove()
+        for optimizer, owner, _ in self._addresses:
+            state = optimizer.state[owner]
+            for key in ("exp_avg", "exp_avg_sq"):
+                if key in state:
+                    state[key] = state[key].clone()
 
 
 def adam_step(

@@ -1,62 +1,77 @@
-"""How the update is compiled, and what happens where it cannot be."""
+"""How a function of tensors is compiled, and what happens where it cannot be."""
 
 from __future__ import annotations
 
 import sys
 import time
 import warnings
+from collections.abc import Callable, Hashable
+from types import FunctionType
+from typing import Any
 
 import torch as th
 
-from sb3_flowpolicy.engine.update import Batch, Losses, TrainState, Update
 
+class Compiled:
+    """A function compiled into one graph per kind of call.
 
-def compile_update(update: Update) -> Update:
-    """Compile an update into one graph: gradients, optimisers and target networks included.
-
-    Compilation happens at the first call, which says so: it takes 10 to 30 seconds, less from the
-    second run on, as torch caches it on disk. Where it fails, for want of a C++ compiler say, the
-    update runs eagerly ever after.
+    Compilation happens at the first call, which says so: the SAC update takes 10 to 30 seconds,
+    less from the second run on, as torch caches it on disk. Where it fails, for want of a C++
+    compiler say, the function runs eagerly ever after, with one warning.
 
     Args:
-        update: The update of :func:`~sb3_flowpolicy.engine.update.make_update`.
-
-    Returns:
-        A function that does the same.
+        function: Function of tensors; its closure must not change.
+        name: What to call it in messages.
+        device: Where the tensors are.
     """
-    compiled = th.compile(update, fullgraph=True, dynamic=False)
-    known: set[bool] = set()
-    broken = False
 
-    def call(
-        state: TrainState, batch: Batch, learning_rate: th.Tensor, move_target: bool
-    ) -> Losses:
-        nonlocal broken
-        if broken:
-            return update(state, batch, learning_rate, move_target)
-        if move_target not in known:
-            _say("Compiling the SAC update ...")
+    def __init__(self, function: Callable[..., Any], name: str, device: th.device) -> None:
+        self.function = function
+        self.name = name
+        self.broken = False
+        self._graphs: dict[Hashable, Callable[..., Any]] = {}
+        # Dynamo would check at each call that modules and shapes are those it compiled for, which
+        # takes as long as the update of a small network. Here the caller knows: see __call__.
+        self._options: dict[str, Any] = {"guard_filter_fn": th.compiler.skip_all_guards_unsafe}
+        # Launching kernels from Python would cost more than running them.
+        faster = "triton.cudagraphs" if device.type == "cuda" else "cpp_wrapper"
+        self._options[faster] = True
+
+    def __call__(self, key: Hashable, *arguments: Any) -> Any:
+        """Call the function.
+
+        Args:
+            key: Tells apart calls that need different graphs: other shapes, other flags.
+            *arguments: The function's arguments.
+        """
+        if self.broken:
+            return self.function(*arguments)
+        graph = self._graphs.get(key)
+        return self._compile(key, *arguments) if graph is None else graph(*arguments)
+
+    def _compile(self, key: Hashable, *arguments: Any) -> Any:
+        _say(f"Compiling {self.name} ...")
         start = time.perf_counter()
+        # A function of its own per graph: dynamo keeps its graphs with a function's code.
+        code = self.function.__code__.replace()
+        function = FunctionType(code, self.function.__globals__, closure=self.function.__closure__)
+        graph = th.compile(function, fullgraph=True, dynamic=False, options=self._options)
         try:
             # Lets torch.autograd.grad be traced; switched on for our graph alone.
             with th._dynamo.config.patch(trace_autograd_ops=True):
-                losses = compiled(state, batch, learning_rate, move_target)
+                result = graph(*arguments)
         except (th._dynamo.exc.TorchDynamoException, th._inductor.exc.InductorError) as error:
-            broken = True
-            reason = str(error).strip().splitlines()[0]
+            self.broken = True
             warnings.warn(
-                "the SAC update could not be compiled and runs eagerly: the same numbers, only "
-                f"slower ({type(error).__name__}: {reason})",
+                f"{self.name} could not be compiled and runs eagerly: the same numbers, only "
+                f"slower ({type(error).__name__}: {str(error).strip().splitlines()[0]})",
                 RuntimeWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
-            return update(state, batch, learning_rate, move_target)
-        if move_target not in known:
-            known.add(move_target)
-            _say(f"Compiled the SAC update in {time.perf_counter() - start:.0f} s")
-        return losses
-
-    return call
+            return self.function(*arguments)
+        _say(f"Compiled {self.name} in {time.perf_counter() - start:.0f} s")
+        self._graphs[key] = graph
+        return result
 
 
 def _say(text: str) -> None:

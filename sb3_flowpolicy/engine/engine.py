@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
-from sb3_flowpolicy.engine.compiling import compile_update
+from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import sample_transitions
@@ -98,8 +98,16 @@ class Engine:
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
         self.settings = update_settings(first, critic_loss_coef)
-        update = make_update(self.networks, self.settings)
-        self._update = compile_update(update) if compiled else update
+        self._update = make_update(self.networks, self.settings)
+        device = self.networks.actor.data.device
+        self._compiled_update = Compiled(self._update, "the SAC update", device)
+        networks = self.networks
+
+        def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
+            return networks.sample(actor, obs, noise)[0]
+
+        self._sample = sample
+        self._compiled_sample = Compiled(sample, "the policy", device)
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
@@ -120,6 +128,24 @@ class Engine:
         """Give modules and optimisers memory of their own; the engine must not be used again."""
         for part in self._parts():
             part.release()
+
+    @th.no_grad()
+    def act(self, obs: th.Tensor) -> th.Tensor:
+        """Sample actions for collecting experience.
+
+        Args:
+            obs: Observations of N environments per seed, (S, N, ...).
+
+        Returns:
+            Scaled actions in [-1, 1], (S, N, D).
+        """
+        self.synchronize()
+        actor = self.networks.actor.data
+        shape = (*obs.shape[:2], self.networks.noise_dim)
+        noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
+        if self.compiled:
+            return self._compiled_sample(obs.shape, actor, obs, noise)
+        return self._sample(actor, obs, noise)
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""
@@ -153,7 +179,10 @@ class Engine:
                 model.get_vec_normalize_env(),
             )
             columns.append([part.unflatten(0, (n_updates, batch_size)) for part in sampled])
-        stacked = [th.stack(parts, dim=1) for parts in zip(*columns, strict=True)]
+        if len(columns) == 1:
+            stacked = [part.unsqueeze(1) for part in columns[0]]
+        else:
+            stacked = [th.stack(parts, dim=1) for parts in zip(*columns, strict=True)]
         shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
         data = self.networks.actor.data
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
@@ -177,5 +206,9 @@ class Engine:
         history = []
         for k, batch in enumerate(self.draw(n_updates, batch_size)):
             move_target = k % first.target_update_interval == 0
-            history.append(self._update(state, batch, learning_rate, move_target))
+            if self.compiled:
+                key = (batch_size, move_target)
+                history.append(self._compiled_update(key, state, batch, learning_rate, move_target))
+            else:
+                history.append(self._update(state, batch, learning_rate, move_target))
         return Losses(*(th.stack(parts).mean(0) for parts in zip(*history, strict=True)))

@@ -61,20 +61,17 @@ class FlatParameters:
         for seed in seeds:
             for owner, view in self.views(self.data, seed):
                 owner.data = view
+        owners = [owner for seed in seeds for owner in self._owners(seed)]
+        self._addresses = [(owner, owner.data_ptr()) for owner in owners]
 
     def is_bound(self) -> bool:
         """Whether the parameters still are views: moving or reassigning a module undoes it."""
-        return all(
-            owner.data_ptr() == view.data_ptr()
-            for seed in range(len(self.layouts))
-            for owner, view in self.views(self.data, seed)
-        )
+        return all(owner.data_ptr() == address for owner, address in self._addresses)
 
     def release(self) -> None:
         """Give every parameter memory of its own again."""
-        for seed in range(len(self.layouts)):
-            for owner, view in self.views(self.data, seed):
-                owner.data = view.clone()
+        for owner, _ in self._addresses:
+            owner.data = owner.data.clone()
 
     def unflatten(self, flat: th.Tensor) -> dict[str, th.Tensor]:
         """Split (S, P) into named tensors of shape (S, *shape), without copying."""

@@ -82,6 +82,12 @@ class DistributionPolicy(SACPolicy):
         )
         return actor.to(self.device)
 
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch batch normalisation and dropout; ``predict`` asks for it at every step."""
+        # Walking through all modules each time would take longer than a small network does.
+        if not self.training == self.actor.training == self.critic.training == mode:
+            super().set_training_mode(mode)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(
