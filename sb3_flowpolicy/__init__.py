@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         MultiInputLowRankPolicy,
     )
     from sb3_flowpolicy.sac_flow import SACFlow
+    from sb3_flowpolicy.seed_batch import SeedBatch
 
 __version__ = "0.1.0"
 
@@ -37,12 +38,14 @@ __all__ = [
     "MultiInputGaussPolicy",
     "MultiInputLowRankPolicy",
     "SACFlow",
+    "SeedBatch",
     "register_distribution",
 ]
 
 _ELSEWHERE = {
     "ActionDistribution": "distributions",
     "SACFlow": "sac_flow",
+    "SeedBatch": "seed_batch",
     "register_distribution": "distributions",
 }
 

@@ -18,7 +18,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
 from sb3_flowpolicy.demonstrations import fill_replay_buffer, load_demonstrations
-from sb3_flowpolicy.engine import Engine, update_settings, why_unsupported
+from sb3_flowpolicy.engine import Engine, Losses, update_settings, why_unsupported
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
@@ -162,6 +162,7 @@ class SACFlow(SAC):
         if self.num_timesteps < random_steps or engine is None or not engine.compiled:
             return super()._sample_action(random_steps, action_noise, n_envs)
         # What SB3 does, less what it spends on finding out that the observation is an array.
+        engine.synchronize()
         obs = th.as_tensor(self._last_obs, device=self.device)
         scaled = engine.act(obs.unsqueeze(0)).squeeze(0).cpu().numpy()
         scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
@@ -182,10 +183,15 @@ class SACFlow(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        losses = engine.train(gradient_steps, batch_size)
+        engine.synchronize()
+        losses = engine.train(engine.draw(gradient_steps, batch_size))
         self._n_updates += gradient_steps
+        self.record_losses(losses)
+
+    def record_losses(self, losses: Losses, seed: int = 0) -> None:
+        """Record what SB3's ``train`` records: means over the last updates, of one seed."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for key, value in losses.of_seed(0).items():
+        for key, value in losses.of_seed(seed).items():
             if key != "ent_coef_loss" or self.ent_coef_optimizer is not None:
                 self.logger.record(f"train/{key}", value)
 

@@ -17,6 +17,8 @@ FLOORS = [
     "engine",
     "demonstrations",
     "sac_flow",
+    "seed_episodes",
+    "seed_batch",
     "diagnostics",
     "zoo",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch as th
+from torch.utils.hooks import RemovableHandle
 
 from sb3_flowpolicy.engine.flat import FlatParameters
 
@@ -47,17 +48,18 @@ class FlatAdam:
         self.settings = settings
         self.flat = flat
         self.optimizers = optimizers
-        # Whoever saves a checkpoint gets step counts that are up to date.
-        self._hooks = [
-            optimizer.register_state_dict_pre_hook(lambda _: self.publish_steps())
-            for optimizer in optimizers
-        ]
+        self._hooks: list[RemovableHandle] = []
         self._addresses: list[tuple[th.optim.Optimizer, th.Tensor, int]] = []
         self.bind()
 
     def bind(self) -> None:
         """Take over the optimisers' states and make them views of ours."""
-        self.publish_steps()
+        self.release()
+        # Whoever saves a checkpoint gets step counts that are up to date.
+        self._hooks = [
+            optimizer.register_state_dict_pre_hook(lambda _: self.publish_steps())
+            for optimizer in self.optimizers
+        ]
         data = self.flat.data
         self.mean, self.square = th.zeros_like(data), th.zeros_like(data)
         #: Number of steps taken, (S, 1): float64, as 1 - 0.999^t needs its digits.
@@ -101,6 +103,7 @@ class FlatAdam:
             for key in ("exp_avg", "exp_avg_sq"):
                 if key in state:
                     state[key] = state[key].clone()
+        self._hooks, self._addresses = [], []
 
 
 def adam_step(

@@ -119,30 +119,31 @@ class Engine:
         ]
 
     def synchronize(self) -> None:
-        """Take over what was loaded or moved since the last update."""
+        """Take over what was loaded or moved since the last update; cheap if nothing was."""
         if not all(part.is_bound() for part in self._parts()):
             for part in self._parts():
                 part.bind()
 
     def release(self) -> None:
-        """Give modules and optimisers memory of their own; the engine must not be used again."""
+        """Give modules and optimisers memory of their own, until the next update."""
         for part in self._parts():
             part.release()
 
     @th.no_grad()
-    def act(self, obs: th.Tensor) -> th.Tensor:
+    def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
         """Sample actions for collecting experience.
 
         Args:
             obs: Observations of N environments per seed, (S, N, ...).
+            noise: Standard normals, (S, N, M). Default: drawn here.
 
         Returns:
             Scaled actions in [-1, 1], (S, N, D).
         """
-        self.synchronize()
         actor = self.networks.actor.data
-        shape = (*obs.shape[:2], self.networks.noise_dim)
-        noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
+        if noise is None:
+            shape = (*obs.shape[:2], self.networks.noise_dim)
+            noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
         if self.compiled:
             return self._compiled_sample(obs.shape, actor, obs, noise)
         return self._sample(actor, obs, noise)
@@ -188,27 +189,28 @@ class Engine:
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
         return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
 
-    def train(self, n_updates: int, batch_size: int) -> Losses:
-        """Perform updates of all models.
+    def train(self, batches: Sequence[Batch]) -> Losses:
+        """Perform one update of all models per batch.
 
         Args:
-            n_updates: Number of updates, at least 1.
-            batch_size: Transitions per update and model.
+            batches: As :meth:`draw` returns them, at least one.
 
         Returns:
             Means over the updates, per model.
         """
-        self.synchronize()
         first = self.models[0]
         rate = first.policy.actor.optimizer.param_groups[0]["lr"]
         learning_rate = th.tensor(rate, dtype=th.float64, device=self.networks.actor.data.device)
         state = self.state()
         history = []
-        for k, batch in enumerate(self.draw(n_updates, batch_size)):
+        for k, batch in enumerate(batches):
             move_target = k % first.target_update_interval == 0
             if self.compiled:
-                key = (batch_size, move_target)
-                history.append(self._compiled_update(key, state, batch, learning_rate, move_target))
+                key = (batch.noise.shape, move_target)
+                losses = self._compiled_update(key, state, batch, learning_rate, move_target)
             else:
-                history.append(self._update(state, batch, learning_rate, move_target))
+                losses = self._update(state, batch, learning_rate, move_target)
+            history.append(losses)
+        if len(history) == 1:
+            return history[0]
         return Losses(*(th.stack(parts).mean(0) for parts in zip(*history, strict=True)))

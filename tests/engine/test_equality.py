@@ -219,7 +219,7 @@ def test_settings_changed_between_updates_are_noticed() -> None:
 def test_released_models_own_their_memory() -> None:
     models = [make(SACFlow, "FlowPolicy", th.float32, seed=seed) for seed in range(2)]
     engine = Engine(models)
-    engine.train(2, BATCH_SIZE)
+    engine.train(engine.draw(2, BATCH_SIZE))
     before = everything(models[0])
     engine.release()
     assert_close(everything(models[0]), before, th.float32)

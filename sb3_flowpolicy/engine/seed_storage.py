@@ -1,0 +1,152 @@
+"""Replay storage and random numbers of S seeds, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_flowpolicy.engine.update import Batch
+
+# Random numbers are drawn for this many updates or steps at once: a call per seed costs as much
+# for one as for many.
+AHEAD = 64
+
+
+class SeedStorage:
+    """Replay buffers of S models as one: written once per step, read with one gather.
+
+    The models' own buffers become views, so that each of them can be saved like any other. All
+    must be plain SB3 buffers of one environment, on the CPU.
+
+    Args:
+        buffers: One empty or equally filled buffer per seed.
+
+    Raises:
+        ValueError: If a buffer is of another kind, or they are filled differently.
+    """
+
+    COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+    def __init__(self, buffers: Sequence[ReplayBuffer]) -> None:
+        for buffer in buffers:
+            if type(buffer) is not ReplayBuffer or buffer.optimize_memory_usage:
+                raise ValueError(
+                    f"replay buffers must be plain ReplayBuffers, got {type(buffer).__name__} with "
+                    f"optimize_memory_usage={buffer.optimize_memory_usage}"
+                )
+        if len({(buffer.pos, buffer.full) for buffer in buffers}) > 1:
+            sizes = [buffer.size() for buffer in buffers]
+            raise ValueError(f"replay buffers must be equally filled, got {sizes} transitions")
+        self.buffers = list(buffers)
+        first = buffers[0]
+        self.capacity, self.pos, self.full = first.buffer_size, first.pos, first.full
+        self.columns: dict[str, np.ndarray] = {}
+        for name in self.COLUMNS:
+            parts = [getattr(buffer, name) for buffer in buffers]
+            # One seed's copy at a time: two buffers of all seeds would not be needed at once.
+            column = np.zeros((parts[0].shape[0], len(parts), *parts[0].shape[2:]), parts[0].dtype)
+            for seed, buffer in enumerate(buffers):
+                if buffer.size():
+                    column[:, seed] = getattr(buffer, name)[:, 0]
+                setattr(buffer, name, column[:, seed : seed + 1])
+            self.columns[name] = column
+        self._flat = {name: th.from_numpy(col).flatten(0, 1) for name, col in self.columns.items()}
+
+    def __len__(self) -> int:
+        """Number of transitions per seed."""
+        return self.capacity if self.full else self.pos
+
+    def add(self, **values: np.ndarray) -> None:
+        """Append one transition per seed; each value has a leading axis S."""
+        for name, value in values.items():
+            self.columns[name][self.pos] = value
+        self.pos = (self.pos + 1) % self.capacity
+        self.full = self.full or self.pos == 0
+
+    def publish(self) -> None:
+        """Tell the models' own buffers how full they are."""
+        for buffer in self.buffers:
+            buffer.pos, buffer.full = self.pos, self.full
+
+    def gather(self, rows: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
+        """Return minibatches.
+
+        Args:
+            rows: Indices of transitions, (n, S, B), below the storage's length.
+            gamma: Discount factor.
+            noise: Standard normals, (n, 2, S, B, M).
+
+        Returns:
+            n batches.
+        """
+        n_seeds = len(self.buffers)
+        index = (rows * n_seeds + th.arange(n_seeds).unsqueeze(-1)).flatten()
+        taken = {
+            name: column.index_select(0, index).unflatten(0, rows.shape)
+            for name, column in self._flat.items()
+        }
+        # A time limit is no end of the world: its value is bootstrapped.
+        dones = taken["dones"] * (1 - taken["timeouts"])
+        discounts = th.full_like(dones, gamma)
+        columns = (
+            taken["observations"],
+            taken["actions"],
+            taken["next_observations"],
+            dones,
+            taken["rewards"],
+            discounts,
+            noise,
+        )
+        return [Batch(*(column[k] for column in columns)) for k in range(len(rows))]
+
+
+class SeedNoise:
+    """Random numbers of S seeds, each from a generator of its own.
+
+    What a seed draws does not depend on which other seeds it shares a batch with.
+
+    Args:
+        seeds: The seeds.
+        shape: Shape of what one seed needs at a time.
+        stream: Tells apart several uses by the same seed.
+        uniform: Whether to draw from [0, 1) instead of a standard normal.
+    """
+
+    def __init__(
+        self, seeds: Sequence[int], shape: tuple[int, ...], stream: int, uniform: bool = False
+    ) -> None:
+        self.shape = shape
+        self.uniform = uniform
+        self.generators = [
+            th.Generator().manual_seed(
+                int(np.random.SeedSequence((seed, stream)).generate_state(1)[0])
+            )
+            for seed in seeds
+        ]
+        self._pool = th.empty(0)
+        self._next = AHEAD
+
+    def draw(self) -> th.Tensor:
+        """Return the next numbers of every seed, (S, *shape)."""
+        if self._next == AHEAD:
+            draw = th.rand if self.uniform else th.randn
+            self._pool = th.stack(
+                [draw(AHEAD, *self.shape, generator=generator) for generator in self.generators], 1
+            )
+            self._next = 0
+        self._next += 1
+        return self._pool[self._next - 1]
+
+    def state(self) -> dict[str, object]:
+        """Return what is needed to go on with the same numbers."""
+        states = [generator.get_state() for generator in self.generators]
+        return {"generators": states, "pool": self._pool, "next": self._next}
+
+    def set_state(self, state: dict[str, object]) -> None:
+        """Go on where :meth:`state` was taken."""
+        for generator, saved in zip(self.generators, state["generators"], strict=True):  # type: ignore[call-overload]
+            generator.set_state(saved)
+        self._pool, self._next = state["pool"], state["next"]  # type: ignore[assignment]

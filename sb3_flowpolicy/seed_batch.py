@@ -1,0 +1,282 @@
+"""SeedBatch: S independent agents trained in lockstep, for little more than the price of one."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from stable_baselines3.common import callbacks as sb3_callbacks
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_flowpolicy.engine import Engine, Losses, why_unsupported
+from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
+from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.sac_flow import SACFlow
+from sb3_flowpolicy.seed_episodes import SeedEpisodes
+
+EnvFactory = Callable[[], gym.Env]
+
+
+class SeedBatch:
+    """Train S independent :class:`SACFlow` agents in one process, by stacking their networks.
+
+    Each seed has its own environment, replay buffer, random numbers and logs; given the same
+    minibatches and noise, one stacked update equals S single ones. Memory: S replay buffers
+    (buffer_size x (2 obs + action + 3) x 4 bytes each), S sets of parameters with their
+    optimisers' moments, and random numbers for 64 updates ahead (64 x 3 x batch_size x M x 4
+    bytes per seed).
+
+    Args:
+        policy: As for :class:`SACFlow`.
+        env: Registered id, or a function that makes an environment. Where the environment has a
+            vectorised form of its own, that is used.
+        seeds: The seeds, or their number, which stands for 0, 1, ...
+        algorithm: Class of the agents.
+        monitor_dir: Folder for one ``monitor.csv`` per seed, as SB3's ``Monitor`` writes them.
+        **kwargs: Arguments of the agents, the same for all.
+
+    Raises:
+        ValueError: If there are no seeds, or the agents' settings cannot be stacked: training
+            per episode, other replay buffers than plain ones, whatever the engine cannot do.
+
+    Example:
+        >>> batch = SeedBatch("FlowPolicy", "Pendulum-v1", seeds=3, learning_starts=20)
+        >>> [model.num_timesteps for model in batch.learn(25).models]
+        [25, 25, 25]
+    """
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: str | EnvFactory,
+        seeds: int | Iterable[int],
+        algorithm: type[SACFlow] = SACFlow,
+        monitor_dir: str | Path | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.seeds = list(range(seeds)) if isinstance(seeds, int) else [int(s) for s in seeds]
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds must be different and at least one, got {seeds!r}")
+        self.env = env
+        self._models = [
+            algorithm(policy, self._make_env(), seed=seed, **kwargs) for seed in self.seeds
+        ]
+        first = self._models[0]
+        self._check(first)
+        buffers = [model.replay_buffer for model in self._models]
+        self._storage = SeedStorage(buffers)  # type: ignore[arg-type]
+        self._engine: Engine | None = None
+        self._episodes = SeedEpisodes(self._models, self.seeds, self._before_dump, monitor_dir)
+        self._losses: Losses | None = None
+        self._venv = self._make_vec_env()
+        self._obs: np.ndarray | None = None
+        assert isinstance(first.actor, FlowActor)
+        noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
+        self._noise = {
+            "random actions": SeedNoise(self.seeds, shape, 0, uniform=True),
+            "actions": SeedNoise(self.seeds, (1, noise_dim), 1),
+            "updates": SeedNoise(self.seeds, (2, first.batch_size, noise_dim), 2),
+            "rows": SeedNoise(self.seeds, (first.batch_size,), 3, uniform=True),
+        }
+
+    @staticmethod
+    def _check(model: SACFlow) -> None:
+        reason = why_unsupported(model)
+        if reason is not None:
+            raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
+        assert isinstance(model.train_freq, TrainFreq)
+        if model.train_freq.unit is not TrainFrequencyUnit.STEP or model.gradient_steps < 0:
+            raise ValueError(
+                "train_freq must count steps and gradient_steps be at least 0 for seeds to stay in "
+                f"step, got {model.train_freq} and {model.gradient_steps}"
+            )
+        if model.action_noise is not None or model.device.type != "cpu":
+            raise ValueError(
+                "agents must collect on the CPU and without action_noise, got "
+                f"device {model.device} and action_noise {model.action_noise}"
+            )
+
+    @property
+    def models(self) -> list[SACFlow]:
+        """The agents: ordinary models that save, load, predict and train on their own."""
+        return self._models
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: BaseCallback | list[BaseCallback] | None = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "SACFlow",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SeedBatch:
+        """Train all agents; the arguments are those of SB3's ``learn``.
+
+        Args:
+            total_timesteps: Environment steps per agent.
+            callback: Callback, copied for each agent; training stops when any copy says so.
+            log_interval: Episodes between two dumps of an agent's log.
+            tb_log_name: Name of the TensorBoard runs, which get ``_seed<seed>`` appended.
+            reset_num_timesteps: Whether to count from zero, or to go on.
+            progress_bar: Whether to show one.
+
+        Returns:
+            Itself.
+        """
+        callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
+        first = self._models[0]
+        total = first._total_timesteps
+        if self._obs is None or reset_num_timesteps:
+            # Typed as one seed, documented as one per environment.
+            self._obs, _ = self._venv.reset(seed=list(self.seeds))  # type: ignore[arg-type]
+            self._episodes.restart()
+        assert isinstance(first.train_freq, TrainFreq)
+        frequency = first.train_freq.frequency
+        bar = make_progress_bar(total - first.num_timesteps) if progress_bar else None
+        going = True
+        while going and first.num_timesteps < total:
+            collected = 0
+            while going and collected < frequency:
+                going = self._step(callbacks, log_interval)
+                collected += 1
+            if bar is not None:
+                bar.update(collected)
+            if going and first.num_timesteps > first.learning_starts and first.gradient_steps:
+                self._train()
+        if bar is not None:
+            bar.close()
+        for one in callbacks:
+            one.on_training_end()
+        self._storage.publish()
+        assert self._engine is not None
+        self._engine.release()
+        return self
+
+    def _start(
+        self,
+        total_timesteps: int,
+        callback: BaseCallback | list[BaseCallback] | None,
+        tb_log_name: str,
+        reset_num_timesteps: bool,
+    ) -> list[BaseCallback]:
+        """Do what SB3's ``learn`` does first, for every agent."""
+        template = CallbackList(callback) if isinstance(callback, list) else callback
+        callbacks = []
+        for seed, model in zip(self.seeds, self._models, strict=True):
+            own = copy.deepcopy(template)
+            name = f"{tb_log_name}_seed{seed}"
+            # SB3 draws the first observation from the model's own environment; ours are stepped.
+            _, ready = model._setup_learn(total_timesteps, own, reset_num_timesteps, name)
+            ready.on_training_start({"self": model}, {})
+            callbacks += [ready] if own is not None else []
+        first = self._models[0]
+        compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
+        if self._engine is None or (compiled and not self._engine.compiled):
+            self._engine = Engine(self._models, first.critic_loss_coef, compiled)
+        self._engine.synchronize()
+        return callbacks
+
+    def _step(self, callbacks: list[BaseCallback], log_interval: int | None) -> bool:
+        """Step all environments once; return whether to go on."""
+        assert self._obs is not None
+        first = self._models[0]
+        scaled = self._act(self._obs)
+        actions = first.policy.unscale_action(scaled)
+        obs, rewards, terminated, truncated, infos = self._venv.step(actions)
+        dones = terminated | truncated
+        next_obs = obs
+        if dones.any():
+            # The environment has been reset already; what it ended with is in the info.
+            next_obs = obs.copy()
+            for seed in np.flatnonzero(dones).tolist():
+                next_obs[seed] = infos["final_obs"][seed]
+        self._storage.add(
+            observations=self._obs,
+            next_observations=next_obs,
+            actions=scaled.reshape(len(scaled), -1),
+            rewards=rewards,
+            dones=dones,
+            timeouts=truncated & ~terminated,
+        )
+        self._obs = obs
+        for model in self._models:
+            model.num_timesteps += 1
+            model._current_progress_remaining = 1 - model.num_timesteps / model._total_timesteps
+        going = True
+        if callbacks:
+            self._storage.publish()
+            for seed, one in enumerate(callbacks):
+                one.update_locals({"rewards": rewards[[seed]], "dones": dones[[seed]]})
+                going = one.on_step() and going
+        self._episodes.step(rewards, dones, infos, log_interval)
+        return going
+
+    def _act(self, obs: np.ndarray) -> np.ndarray:
+        """Return scaled actions, (S, *shape)."""
+        first = self._models[0]
+        random_steps = first.learning_starts if first.random_steps is None else first.random_steps
+        if first.num_timesteps < random_steps:
+            return self._noise["random actions"].draw().numpy() * 2 - 1
+        assert self._engine is not None
+        noise = self._noise["actions"].draw()
+        actions = self._engine.act(th.from_numpy(obs).unsqueeze(1), noise)
+        return actions.squeeze(1).numpy().reshape(len(obs), *(first.action_space.shape or ()))
+
+    def _train(self) -> None:
+        """Update all agents ``gradient_steps`` times."""
+        assert self._engine is not None
+        first = self._models[0]
+        rate = first.lr_schedule(first._current_progress_remaining)
+        if rate != first.actor.optimizer.param_groups[0]["lr"]:
+            for model in self._models:
+                update_learning_rate(model.actor.optimizer, rate)
+        draws = range(first.gradient_steps)
+        rows = th.stack([self._noise["rows"].draw() for _ in draws])
+        noise = th.stack([self._noise["updates"].draw().movedim(1, 0) for _ in draws])
+        index = (rows * len(self._storage)).long()
+        self._losses = self._engine.train(self._storage.gather(index, first.gamma, noise))
+        for model in self._models:
+            model._n_updates += first.gradient_steps
+
+    def _before_dump(self, seed: int) -> None:
+        """Record what SB3 records at each update only now that somebody reads it."""
+        model = self._models[seed]
+        if self._losses is not None:
+            rate = model.actor.optimizer.param_groups[0]["lr"]
+            model.logger.record("train/learning_rate", rate)
+            model.record_losses(self._losses, seed)
+
+    def _make_vec_env(self) -> VectorEnv:
+        """Use the environment's own vectorised form, or step S of them one by one."""
+        mode = AutoresetMode.SAME_STEP
+        if isinstance(self.env, str) and gym.spec(self.env).vector_entry_point is not None:
+            return gym.make_vec(
+                self.env,
+                num_envs=len(self.seeds),
+                vectorization_mode="vector_entry_point",
+                autoreset_mode=mode,
+            )
+        return SyncVectorEnv([self._make_env] * len(self.seeds), autoreset_mode=mode)
+
+    def _make_env(self) -> gym.Env:
+        return gym.make(self.env) if isinstance(self.env, str) else self.env()
+
+
+def make_progress_bar(total: int) -> Any:
+    """Return SB3's own progress bar.
+
+    Raises:
+        ImportError: If tqdm or rich is missing.
+    """
+    if sb3_callbacks.tqdm is None:
+        raise ImportError('the progress bar needs tqdm and rich: pip install "sb3_flowpolicy[zoo]"')
+    return sb3_callbacks.tqdm(total=total)

@@ -1,0 +1,88 @@
+"""What SB3's Monitor and logger know about episodes, for S environments stepped at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+
+class SeedEpisodes:
+    """Counts returns and lengths of S running episodes, and tells models of finished ones.
+
+    Args:
+        models: One model per environment.
+        seeds: Their seeds, for file names.
+        before_dump: Called with an index just before that model's log is written.
+        monitor_dir: Folder for ``seed_<seed>.monitor.csv``; None writes none.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[OffPolicyAlgorithm],
+        seeds: Sequence[int],
+        before_dump: Callable[[int], None],
+        monitor_dir: str | Path | None = None,
+    ) -> None:
+        self.models = models
+        self.before_dump = before_dump
+        self.returns = np.zeros(len(models))
+        self.lengths = np.zeros(len(models), dtype=int)
+        self.start = time.time()
+        self.writers: list[ResultsWriter] = []
+        if monitor_dir is not None:
+            header: dict[str, float | str] = {"t_start": self.start}
+            self.writers = [
+                ResultsWriter(str(Path(monitor_dir, f"seed_{seed}")), header) for seed in seeds
+            ]
+
+    def step(
+        self,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        infos: dict[str, Any],
+        log_interval: int | None,
+    ) -> None:
+        """Account for one step of all environments.
+
+        Args:
+            rewards: Rewards, (S,).
+            dones: Which episodes ended, (S,).
+            infos: Infos of a vectorised environment that resets in the same step.
+            log_interval: Episodes between two dumps of a model's log; None dumps none.
+        """
+        self.returns += rewards
+        self.lengths += 1
+        if not dones.any():
+            return
+        success = infos.get("final_info", {}).get("is_success")
+        for seed in np.flatnonzero(dones).tolist():
+            model = self.models[seed]
+            episode = {
+                "r": round(float(self.returns[seed]), 6),
+                "l": int(self.lengths[seed]),
+                "t": round(time.time() - self.start, 6),
+            }
+            assert model.ep_info_buffer is not None
+            assert model.ep_success_buffer is not None
+            model.ep_info_buffer.append(episode)
+            if success is not None:
+                model.ep_success_buffer.append(bool(success[seed]))
+            if self.writers:
+                self.writers[seed].write_row(episode)
+            model._episode_num += 1
+            if log_interval is not None and model._episode_num % log_interval == 0:
+                self.before_dump(seed)
+                model.dump_logs()
+        self.returns[dones] = 0
+        self.lengths[dones] = 0
+
+    def restart(self) -> None:
+        """Forget the running episodes: their environments were reset."""
+        self.returns[:] = 0
+        self.lengths[:] = 0
