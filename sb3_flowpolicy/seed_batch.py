@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +67,18 @@ class SeedBatch:
         self.seeds = list(range(seeds)) if isinstance(seeds, int) else [int(s) for s in seeds]
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds must be different and at least one, got {seeds!r}")
-        self.env = env
-        self._models = [
-            algorithm(policy, self._make_env(), seed=seed, **kwargs) for seed in self.seeds
-        ]
-        first = self._models[0]
+        models = [algorithm(policy, _make_env(env), seed=seed, **kwargs) for seed in self.seeds]
+        self._adopt(models, self.seeds, env, monitor_dir)
+
+    def _adopt(
+        self,
+        models: list[SACFlow],
+        seeds: list[int],
+        env: str | EnvFactory,
+        monitor_dir: str | Path | None,
+    ) -> None:
+        self.env, self.seeds, self._models = env, seeds, models
+        first = models[0]
         self._check(first)
         buffers = [model.replay_buffer for model in self._models]
         self._storage = SeedStorage(buffers)  # type: ignore[arg-type]
@@ -160,6 +168,62 @@ class SeedBatch:
         assert self._engine is not None
         self._engine.release()
         return self
+
+    def save(self, folder: str | Path) -> None:
+        """Save all agents, their replay buffers and their random numbers.
+
+        The running episodes are not saved: a loaded batch begins new ones.
+
+        Args:
+            folder: Where to; one ``seed_<seed>.zip`` and ``.buffer.pkl`` per agent, which can also
+                be loaded on their own, and ``batch.pt``.
+        """
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        for seed, model in zip(self.seeds, self._models, strict=True):
+            model.save(Path(folder, f"seed_{seed}.zip"))
+            model.save_replay_buffer(Path(folder, f"seed_{seed}.buffer.pkl"))
+        noise = {name: one.state() for name, one in self._noise.items()}
+        partial = Path(folder, "batch.pt.partial")
+        th.save({"seeds": self.seeds, "noise": noise}, partial)
+        partial.replace(Path(folder, "batch.pt"))
+        self._obs = None
+
+    @classmethod
+    def load(
+        cls,
+        folder: str | Path,
+        env: str | EnvFactory,
+        algorithm: type[SACFlow] = SACFlow,
+        monitor_dir: str | Path | None = None,
+    ) -> SeedBatch:
+        """Load what :meth:`save` wrote; ``learn(..., reset_num_timesteps=False)`` goes on.
+
+        Args:
+            folder: Folder of a saved batch.
+            env: As at construction.
+            algorithm: Class of the agents.
+            monitor_dir: As at construction.
+
+        Returns:
+            The batch.
+
+        Raises:
+            ValueError: If the folder holds no complete batch.
+        """
+        if not Path(folder, "batch.pt").is_file():
+            raise ValueError(f"folder must hold a saved batch, got {folder}")
+        saved = th.load(Path(folder, "batch.pt"), weights_only=True)
+        batch = cls.__new__(cls)
+        models = []
+        for seed in saved["seeds"]:
+            path = Path(folder, f"seed_{seed}.zip")
+            model = algorithm.load(path, env=_make_env(env), device="cpu")
+            model.load_replay_buffer(Path(folder, f"seed_{seed}.buffer.pkl"))
+            models.append(model)
+        batch._adopt(models, saved["seeds"], env, monitor_dir)
+        for name, state in saved["noise"].items():
+            batch._noise[name].set_state(state)
+        return batch
 
     def _start(
         self,
@@ -265,10 +329,12 @@ class SeedBatch:
                 vectorization_mode="vector_entry_point",
                 autoreset_mode=mode,
             )
-        return SyncVectorEnv([self._make_env] * len(self.seeds), autoreset_mode=mode)
+        make = partial(_make_env, self.env)
+        return SyncVectorEnv([make] * len(self.seeds), autoreset_mode=mode)
 
-    def _make_env(self) -> gym.Env:
-        return gym.make(self.env) if isinstance(self.env, str) else self.env()
+
+def _make_env(env: str | EnvFactory) -> gym.Env:
+    return gym.make(env) if isinstance(env, str) else env()
 
 
 def make_progress_bar(total: int) -> Any:

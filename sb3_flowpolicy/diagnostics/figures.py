@@ -71,11 +71,15 @@ def samples_figure(samples: np.ndarray) -> Figure:
     """
     if samples.ndim != 3 or samples.shape[-1] != 2:
         raise ValueError(f"samples must have shape (states, samples, 2), got {samples.shape}")
-    figure = new_figure(2.4 * len(samples), 2.5)
-    for axes, points in zip(
-        figure.subplots(1, len(samples), squeeze=False)[0], samples, strict=True
-    ):
-        axes.scatter(*points.T, s=4, alpha=0.5, color=POLICY_BLUE, linewidths=0)
-        axes.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), aspect="equal")
+    n_columns = min(2, len(samples))
+    n_rows = -(-len(samples) // n_columns)
+    figure = new_figure(2.2 * n_columns, 2.2 * n_rows)
+    # Samples hug the edge of the box when the policy saturates: leave room to see them.
+    limits = (-1.1, 1.1)
+    for panel, points in enumerate(samples):
+        axes = figure.add_subplot(n_rows, n_columns, panel + 1)
+        axes.scatter(points[:, 0], points[:, 1], s=6, alpha=0.5, color=POLICY_BLUE, linewidths=0)
+        axes.set(xlim=limits, ylim=limits, aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
         axes.tick_params(labelsize=7)
+        axes.set_title(f"state {panel}", fontsize=8)
     return figure

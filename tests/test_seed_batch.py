@@ -1,0 +1,211 @@
+"""SeedBatch: S agents at once are S agents, no more and no less."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.envs import IdentityEnvBox
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.noise import NormalActionNoise
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy import SACFlow, SeedBatch
+
+FAST: dict[str, Any] = {
+    "learning_starts": 30,
+    "buffer_size": 500,
+    "batch_size": 16,
+    "device": "cpu",
+    "policy_kwargs": {"net_arch": [16, 16]},
+}
+ENV = "TunnelDiagonal-v0"
+
+
+def vector(model: SACFlow) -> np.ndarray:
+    return model.policy.parameters_to_vector()
+
+
+def test_an_agent_does_not_depend_on_its_company() -> None:
+    """Seed 7 alone, with others, and first or last: the same agent."""
+    alone = SeedBatch("FlowPolicy", ENV, [7], **FAST).learn(90).models[0]
+    first = SeedBatch("FlowPolicy", ENV, [7, 1, 2], **FAST).learn(90).models[0]
+    last = SeedBatch("FlowPolicy", ENV, [5, 7], **FAST).learn(90).models[1]
+    np.testing.assert_allclose(vector(first), vector(alone), rtol=2e-3, atol=2e-4)
+    np.testing.assert_allclose(vector(last), vector(alone), rtol=2e-3, atol=2e-4)
+    assert last.replay_buffer is not None
+    assert alone.replay_buffer is not None
+    np.testing.assert_allclose(
+        last.replay_buffer.observations[:60], alone.replay_buffer.observations[:60], atol=1e-3
+    )
+
+
+def test_seeds_reproduce_and_differ() -> None:
+    def run() -> list[np.ndarray]:
+        models = SeedBatch("LowRankPolicy", ENV, 3, **FAST).learn(60).models
+        return [vector(model) for model in models]
+
+    once, again = run(), run()
+    assert all(np.array_equal(a, b) for a, b in zip(once, again, strict=True))
+    assert not np.array_equal(once[0], once[1])
+
+
+def test_models_are_ordinary_models(tmp_path: Path) -> None:
+    batch = SeedBatch("FlowPolicy", ENV, [3, 4], **FAST).learn(70)
+    obs = np.zeros((5, 2), dtype=np.float32)
+    for model in batch.models:
+        assert model.num_timesteps == 70
+        assert model._n_updates == 40
+        assert model.replay_buffer is not None
+        assert model.replay_buffer.size() == 70
+        expected, _ = model.predict(obs, deterministic=True)
+        model.save(tmp_path / "model")
+        loaded = SACFlow.load(tmp_path / "model", env=gym.make(ENV))
+        np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], expected)
+        model.save_replay_buffer(tmp_path / "buffer")
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        np.testing.assert_array_equal(
+            loaded.replay_buffer.observations[:70],  # type: ignore[union-attr]
+            model.replay_buffer.observations[:70],
+        )
+    # One of them trains on alone and leaves the other as it was.
+    one, other = batch.models
+    before = vector(other)
+    moved = vector(one)
+    one.learn(20, reset_num_timesteps=False)
+    assert not np.array_equal(vector(one), moved)
+    assert np.array_equal(vector(other), before)
+
+
+def test_saved_models_do_not_carry_their_company(tmp_path: Path) -> None:
+    for n_seeds in (1, 8):
+        batch = SeedBatch("FlowPolicy", ENV, n_seeds, **FAST).learn(35)
+        batch.models[0].save(tmp_path / str(n_seeds))
+    alone, stacked = ((tmp_path / f"{n}.zip").stat().st_size for n in (1, 8))
+    assert stacked < 1.1 * alone
+
+
+def test_learning_goes_on_where_it_stopped() -> None:
+    parts = SeedBatch("FlowPolicy", ENV, 2, **FAST)
+    parts.learn(40)
+    parts.learn(30, reset_num_timesteps=False)
+    whole = SeedBatch("FlowPolicy", ENV, 2, **FAST).learn(70)
+    for got, expected in zip(parts.models, whole.models, strict=True):
+        assert got.num_timesteps == expected.num_timesteps == 70
+        np.testing.assert_allclose(vector(got), vector(expected), rtol=1e-4, atol=1e-5)
+
+
+def test_saved_batch_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    straight = SeedBatch("FlowPolicy", ENV, [1, 2], **FAST)
+    straight.learn(45)
+    straight.save(tmp_path / "batch")
+    resumed = SeedBatch.load(tmp_path / "batch", ENV)
+    assert resumed.seeds == [1, 2]
+    for batch in (straight, resumed):
+        # Both begin a new episode: the environment itself is not saved.
+        batch.learn(30, reset_num_timesteps=False)
+    for got, expected in zip(resumed.models, straight.models, strict=True):
+        assert got.num_timesteps == 75
+        assert got.replay_buffer is not None
+        assert got.replay_buffer.size() == 75
+        np.testing.assert_allclose(vector(got), vector(expected), rtol=1e-4, atol=1e-5)
+
+
+def test_environments_without_a_vectorised_form() -> None:
+    batch = SeedBatch("GaussPolicy", lambda: IdentityEnvBox(eps=0.5), 2, **FAST).learn(60)
+    assert all(np.isfinite(vector(model)).all() for model in batch.models)
+
+
+def test_final_observations_and_time_limits_are_stored() -> None:
+    batch = SeedBatch("FlowPolicy", "Pendulum-v1", 2, **{**FAST, "learning_starts": 300}).learn(210)
+    for model in batch.models:
+        buffer = model.replay_buffer
+        assert buffer is not None
+        assert list(np.flatnonzero(buffer.dones[:, 0])) == [199]
+        assert list(np.flatnonzero(buffer.timeouts[:, 0])) == [199]
+        # Within an episode one row's next observation is the next row's observation.
+        assert np.array_equal(buffer.next_observations[:199], buffer.observations[1:200])
+        assert not np.array_equal(buffer.next_observations[199], buffer.observations[200])
+        assert np.abs(buffer.actions[:210]).max() <= 1
+
+
+def test_logs_and_monitors_are_per_seed(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    batch = SeedBatch(
+        "FlowPolicy",
+        ENV,
+        [3, 9],
+        monitor_dir=tmp_path / "monitor",
+        tensorboard_log=str(tmp_path / "tb"),
+        **FAST,
+    )
+    batch.learn(120, tb_log_name="run")
+    assert sorted(path.name for path in (tmp_path / "tb").iterdir()) == [
+        "run_seed3_1",
+        "run_seed9_1",
+    ]
+    results = load_results(str(tmp_path / "monitor"))
+    episodes = sum(model._episode_num for model in batch.models)
+    assert len(results) == episodes
+    assert results["l"].sum() <= 240
+    log = batch.models[0].logger.name_to_value
+    assert batch.models[0].ep_success_buffer is not None
+    assert {"train/critic_loss", "train/actor_loss", "train/learning_rate"} <= set(log) or not log
+
+
+class StopAt(BaseCallback):
+    """Stops a run, and notes what it was shown."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        self.model.seen = self.num_timesteps  # type: ignore[attr-defined]
+        return self.num_timesteps < self.step
+
+
+def test_callbacks_see_every_step_of_their_own_agent() -> None:
+    batch = SeedBatch("FlowPolicy", ENV, 2, **FAST).learn(100, callback=StopAt(50))
+    assert [model.seen for model in batch.models] == [50, 50]  # type: ignore[attr-defined]
+    assert [model.num_timesteps for model in batch.models] == [50, 50]
+
+
+def test_learns_what_a_single_agent_learns() -> None:
+    """A bandit with a clear best action: all seeds must find it."""
+    settings = {**FAST, "ent_coef": 0.01, "learning_rate": 3e-3, "gamma": 0.0, "batch_size": 64}
+    batch = SeedBatch(
+        "FlowPolicy",
+        lambda: gym.make("Tunnel-v0", width=2.0, goal_reward=0.0, dense_reward=10.0),
+        3,
+        **settings,
+    ).learn(700)
+    for model in batch.models:
+        action, _ = model.predict(np.zeros(2, dtype=np.float32), deterministic=True)
+        assert action.min() > 0.7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seeds": 0}, "seeds must be different and at least one, got 0"),
+        ({"seeds": [1, 1]}, r"seeds must be different and at least one, got \[1, 1\]"),
+        ({"train_freq": (1, "episode")}, "train_freq must count steps"),
+        ({"gradient_steps": -1}, "gradient_steps be at least 0"),
+        ({"n_steps": 3}, "replay buffers must be plain ReplayBuffers, got NStepReplayBuffer"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage=True"),
+        ({"action_noise": NormalActionNoise(np.zeros(2), np.ones(2))}, "without action_noise"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.SGD}}, "got optimizer of type SGD"),
+    ],
+)
+def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
+    settings = {"seeds": 2, **FAST, **arguments}
+    if arguments.get("optimize_memory_usage"):
+        settings["replay_buffer_kwargs"] = {"handle_timeout_termination": False}
+    with pytest.raises(ValueError, match=message):
+        SeedBatch("FlowPolicy", ENV, **settings)
