@@ -19,6 +19,10 @@ FLOORS = [
     "sac_flow",
     "seed_episodes",
     "seed_batch",
+    "benchmarks",
+    "hyperparameters",
+    "train_seeds",
+    "benchmarks",
     "diagnostics",
     "zoo",
 ]

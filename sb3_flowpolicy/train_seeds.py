@@ -1,0 +1,120 @@
+"""`python -m sb3_flowpolicy.train_seeds`: many seeds at once, from the zoo's hyperparameters."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.seed_batch import SeedBatch
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Train, evaluate and save as the command line says.
+
+    Args:
+        arguments: Command line without the program's name. Default: that of the process.
+
+    Raises:
+        ValueError: If an argument is out of range.
+    """
+    args = _parser().parse_args(arguments)
+    th.set_num_threads(args.num_threads)
+    folder = Path(args.log_folder, args.algo, f"{args.env}_seeds")
+    if args.resume:
+        batch = SeedBatch.load(folder, args.env, monitor_dir=None)
+        done = batch.models[0].num_timesteps
+    else:
+        batch, done = _new_batch(args, folder), 0
+    total = args.n_timesteps or load_hyperparameters(args.algo, args.env)["n_timesteps"]
+    print(f"{args.algo} on {args.env}, seeds {batch.seeds}: {total - done} steps each", flush=True)
+    batch.learn(
+        max(total - done, 0),
+        tb_log_name=f"{args.algo}_{args.env}",
+        reset_num_timesteps=not args.resume,
+        progress_bar=args.progress,
+    )
+    batch.save(folder)
+    _report(batch, args.env, args.eval_episodes)
+    print(f"Saved to {folder}")
+
+
+def _new_batch(args: argparse.Namespace, folder: Path) -> SeedBatch:
+    settings = {**load_hyperparameters(args.algo, args.env), **_overrides(args.hyperparams)}
+    settings.pop("n_timesteps", None)
+    return SeedBatch(
+        settings.pop("policy"),
+        args.env,
+        range(args.first_seed, args.first_seed + args.seeds),
+        monitor_dir=folder,
+        tensorboard_log=args.tensorboard_log,
+        device="cpu",
+        **settings,
+    )
+
+
+def _overrides(pairs: list[str]) -> dict[str, Any]:
+    """Read ``key:value``, the value as YAML."""
+    settings = {}
+    for pair in pairs:
+        key, separator, value = pair.partition(":")
+        if not separator:
+            raise ValueError(f"hyperparams must be of the form key:value, got {pair!r}")
+        settings[key] = yaml.safe_load(value)
+    return settings
+
+
+def _report(batch: SeedBatch, env_id: str, n_episodes: int) -> None:
+    """Print the test return of each seed, the best and the worst alike."""
+    env = make_vec_env(env_id, seed=0)
+    means = []
+    for seed, model in zip(batch.seeds, batch.models, strict=True):
+        mean, std = evaluate_policy(model, env, n_episodes)
+        means.append(mean)
+        print(f"  seed {seed:<4} test return {mean:8.2f} +/- {std:.2f} ({n_episodes} episodes)")
+    print(f"  all       test return {np.mean(means):8.2f} +/- {np.std(means):.2f} over seeds")
+    env.close()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.train_seeds",
+        description="Train several seeds of an agent at once, for little more than the price of "
+        "one, with the hyperparameters that rl_zoo3 would use.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--algo", default="sac_flow", help="sac_flow, sac_lowrank or sac_gauss")
+    add("--env", default="TunnelDiagonal-v0", help="environment id", type=_known_env)
+    add("--seeds", type=int, default=10, help="number of seeds")
+    add("--first-seed", type=int, default=0, help="the seeds are this one and those after it")
+    add("-n", "--n-timesteps", type=int, help="steps per seed (default: the file's)")
+    add("-params", "--hyperparams", nargs="+", default=[], help="overrides, as key:value")
+    add("-f", "--log-folder", default="logs", help="where to save agents and monitor files")
+    add("-tb", "--tensorboard-log", help="TensorBoard folder, one run per seed")
+    add("--eval-episodes", type=int, default=20, help="test episodes per seed at the end")
+    add("--num-threads", type=int, default=1, help="torch threads; small networks like one best")
+    add("-P", "--progress", action="store_true", help="show a progress bar")
+    add("--resume", action="store_true", help="go on with the saved batch, up to n-timesteps")
+    return parser
+
+
+def _known_env(env_id: str) -> str:
+    try:
+        gym.spec(env_id)
+    except gym.error.Error as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return env_id
+
+
+if __name__ == "__main__":
+    main()
