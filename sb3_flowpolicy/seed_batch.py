@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from stable_baselines3.common import callbacks as sb3_callbacks
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.engine import Engine, Losses, why_unsupported
+from sb3_flowpolicy.engine import Engine, Losses
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
-
-EnvFactory = Callable[[], gym.Env]
+from sb3_flowpolicy.seed_setup import (
+    EnvFactory,
+    check_stackable,
+    make_env,
+    make_progress_bar,
+    make_vec_env,
+)
 
 
 class SeedBatch:
@@ -33,7 +34,7 @@ class SeedBatch:
     Each seed has its own environment, replay buffer, random numbers and logs; given the same
     minibatches and noise, one stacked update equals S single ones. Memory: S replay buffers
     (buffer_size x (2 obs + action + 3) x 4 bytes each), S sets of parameters with their
-    optimisers' moments, and random numbers for 64 updates ahead (64 x 3 x batch_size x M x 4
+    optimisers' moments, and random numbers for 64 updates ahead (64 x batch_size x (8 M + 8)
     bytes per seed).
 
     Args:
@@ -67,7 +68,7 @@ class SeedBatch:
         self.seeds = list(range(seeds)) if isinstance(seeds, int) else [int(s) for s in seeds]
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds must be different and at least one, got {seeds!r}")
-        models = [algorithm(policy, _make_env(env), seed=seed, **kwargs) for seed in self.seeds]
+        models = [algorithm(policy, make_env(env), seed=seed, **kwargs) for seed in self.seeds]
         self._adopt(models, self.seeds, env, monitor_dir)
 
     def _adopt(
@@ -79,13 +80,13 @@ class SeedBatch:
     ) -> None:
         self.env, self.seeds, self._models = env, seeds, models
         first = models[0]
-        self._check(first)
+        check_stackable(first)
         buffers = [model.replay_buffer for model in self._models]
         self._storage = SeedStorage(buffers)  # type: ignore[arg-type]
         self._engine: Engine | None = None
         self._episodes = SeedEpisodes(self._models, self.seeds, self._before_dump, monitor_dir)
         self._losses: Losses | None = None
-        self._venv = self._make_vec_env()
+        self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
         assert isinstance(first.actor, FlowActor)
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
@@ -95,23 +96,6 @@ class SeedBatch:
             "updates": SeedNoise(self.seeds, (2, first.batch_size, noise_dim), 2),
             "rows": SeedNoise(self.seeds, (first.batch_size,), 3, uniform=True),
         }
-
-    @staticmethod
-    def _check(model: SACFlow) -> None:
-        reason = why_unsupported(model)
-        if reason is not None:
-            raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
-        assert isinstance(model.train_freq, TrainFreq)
-        if model.train_freq.unit is not TrainFrequencyUnit.STEP or model.gradient_steps < 0:
-            raise ValueError(
-                "train_freq must count steps and gradient_steps be at least 0 for seeds to stay in "
-                f"step, got {model.train_freq} and {model.gradient_steps}"
-            )
-        if model.action_noise is not None or model.device.type != "cpu":
-            raise ValueError(
-                "agents must collect on the CPU and without action_noise, got "
-                f"device {model.device} and action_noise {model.action_noise}"
-            )
 
     @property
     def models(self) -> list[SACFlow]:
@@ -131,7 +115,8 @@ class SeedBatch:
 
         Args:
             total_timesteps: Environment steps per agent.
-            callback: Callback, copied for each agent; training stops when any copy says so.
+            callback: Callback, copied for each agent, whose ``locals`` hold ``rewards`` and
+                ``dones``; training stops when any copy says so.
             log_interval: Episodes between two dumps of an agent's log.
             tb_log_name: Name of the TensorBoard runs, which get ``_seed<seed>`` appended.
             reset_num_timesteps: Whether to count from zero, or to go on.
@@ -142,14 +127,30 @@ class SeedBatch:
         """
         callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
         first = self._models[0]
-        total = first._total_timesteps
         if self._obs is None or reset_num_timesteps:
             # Typed as one seed, documented as one per environment.
             self._obs, _ = self._venv.reset(seed=list(self.seeds))  # type: ignore[arg-type]
             self._episodes.restart()
+        to_go = first._total_timesteps - first.num_timesteps
+        bar = make_progress_bar(to_go) if progress_bar else None
+        try:
+            self._run(callbacks, log_interval, bar)
+        finally:
+            # Whatever happened, the agents are ordinary models again.
+            if bar is not None:
+                bar.close()
+            self._storage.publish()
+            assert self._engine is not None
+            self._engine.release()
+        for one in callbacks:
+            one.on_training_end()
+        return self
+
+    def _run(self, callbacks: list[BaseCallback], log_interval: int | None, bar: Any) -> None:
+        """Alternate between collecting and updating, as SB3 does."""
+        first = self._models[0]
         assert isinstance(first.train_freq, TrainFreq)
-        frequency = first.train_freq.frequency
-        bar = make_progress_bar(total - first.num_timesteps) if progress_bar else None
+        frequency, total = first.train_freq.frequency, first._total_timesteps
         going = True
         while going and first.num_timesteps < total:
             collected = 0
@@ -160,14 +161,6 @@ class SeedBatch:
                 bar.update(collected)
             if going and first.num_timesteps > first.learning_starts and first.gradient_steps:
                 self._train()
-        if bar is not None:
-            bar.close()
-        for one in callbacks:
-            one.on_training_end()
-        self._storage.publish()
-        assert self._engine is not None
-        self._engine.release()
-        return self
 
     def save(self, folder: str | Path) -> None:
         """Save all agents, their replay buffers and their random numbers.
@@ -217,7 +210,7 @@ class SeedBatch:
         models = []
         for seed in saved["seeds"]:
             path = Path(folder, f"seed_{seed}.zip")
-            model = algorithm.load(path, env=_make_env(env), device="cpu")
+            model = algorithm.load(path, env=make_env(env), device="cpu")
             model.load_replay_buffer(Path(folder, f"seed_{seed}.buffer.pkl"))
             models.append(model)
         batch._adopt(models, saved["seeds"], env, monitor_dir)
@@ -247,6 +240,7 @@ class SeedBatch:
         if self._engine is None or (compiled and not self._engine.compiled):
             self._engine = Engine(self._models, first.critic_loss_coef, compiled)
         self._engine.synchronize()
+        self._storage.synchronize()
         return callbacks
 
     def _step(self, callbacks: list[BaseCallback], log_interval: int | None) -> bool:
@@ -289,7 +283,7 @@ class SeedBatch:
         first = self._models[0]
         random_steps = first.learning_starts if first.random_steps is None else first.random_steps
         if first.num_timesteps < random_steps:
-            return self._noise["random actions"].draw().numpy() * 2 - 1
+            return (self._noise["random actions"].draw() * 2 - 1).float().numpy()
         assert self._engine is not None
         noise = self._noise["actions"].draw()
         actions = self._engine.act(th.from_numpy(obs).unsqueeze(1), noise)
@@ -318,31 +312,3 @@ class SeedBatch:
             rate = model.actor.optimizer.param_groups[0]["lr"]
             model.logger.record("train/learning_rate", rate)
             model.record_losses(self._losses, seed)
-
-    def _make_vec_env(self) -> VectorEnv:
-        """Use the environment's own vectorised form, or step S of them one by one."""
-        mode = AutoresetMode.SAME_STEP
-        if isinstance(self.env, str) and gym.spec(self.env).vector_entry_point is not None:
-            return gym.make_vec(
-                self.env,
-                num_envs=len(self.seeds),
-                vectorization_mode="vector_entry_point",
-                autoreset_mode=mode,
-            )
-        make = partial(_make_env, self.env)
-        return SyncVectorEnv([make] * len(self.seeds), autoreset_mode=mode)
-
-
-def _make_env(env: str | EnvFactory) -> gym.Env:
-    return gym.make(env) if isinstance(env, str) else env()
-
-
-def make_progress_bar(total: int) -> Any:
-    """Return SB3's own progress bar.
-
-    Raises:
-        ImportError: If tqdm or rich is missing.
-    """
-    if sb3_callbacks.tqdm is None:
-        raise ImportError('the progress bar needs tqdm and rich: pip install "sb3_flowpolicy[zoo]"')
-    return sb3_callbacks.tqdm(total=total)

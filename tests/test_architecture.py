@@ -18,6 +18,7 @@ FLOORS = [
     "demonstrations",
     "sac_flow",
     "seed_episodes",
+    "seed_setup",
     "seed_batch",
     "benchmarks",
     "hyperparameters",

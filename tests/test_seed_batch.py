@@ -16,6 +16,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow, SeedBatch
+from sb3_flowpolicy.demonstrations import record_demonstrations
 
 FAST: dict[str, Any] = {
     "learning_starts": 30,
@@ -156,6 +157,39 @@ def test_logs_and_monitors_are_per_seed(tmp_path: Path) -> None:
     log = batch.models[0].logger.name_to_value
     assert batch.models[0].ep_success_buffer is not None
     assert {"train/critic_loss", "train/actor_loss", "train/learning_rate"} <= set(log) or not log
+
+
+class Crash(BaseCallback):
+    """Fails in the middle of a run."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 50:
+            raise RuntimeError("no more")
+        return True
+
+
+def test_an_interrupted_batch_leaves_ordinary_models() -> None:
+    batch = SeedBatch("FlowPolicy", ENV, 2, **FAST)
+    with pytest.raises(RuntimeError, match="no more"):
+        batch.learn(100, callback=Crash())
+    one, other = batch.models
+    assert one.replay_buffer is not None
+    assert one.replay_buffer.size() == 50
+    before = vector(other)
+    one.learn(20, reset_num_timesteps=False)
+    assert np.array_equal(vector(other), before)
+    with pytest.raises(ValueError, match=r"must be equally filled, got \[70, 50\] transitions"):
+        batch.learn(10, reset_num_timesteps=False)
+
+
+def test_demonstrations_come_first() -> None:
+    env = gym.make("Pendulum-v1")
+    demos = record_demonstrations(env, lambda obs: np.zeros(1, dtype=np.float32), 25, seed=0)
+    batch = SeedBatch("FlowPolicy", "Pendulum-v1", 2, demonstrations=demos, **FAST).learn(40)
+    for model in batch.models:
+        assert model.replay_buffer is not None
+        assert model.replay_buffer.size() == 65
+        assert np.array_equal(model.replay_buffer.observations[:25, 0], demos["observations"])
 
 
 class StopAt(BaseCallback):

@@ -37,12 +37,10 @@ class SeedStorage:
                     f"replay buffers must be plain ReplayBuffers, got {type(buffer).__name__} with "
                     f"optimize_memory_usage={buffer.optimize_memory_usage}"
                 )
-        if len({(buffer.pos, buffer.full) for buffer in buffers}) > 1:
-            sizes = [buffer.size() for buffer in buffers]
-            raise ValueError(f"replay buffers must be equally filled, got {sizes} transitions")
         self.buffers = list(buffers)
-        first = buffers[0]
-        self.capacity, self.pos, self.full = first.buffer_size, first.pos, first.full
+        self.capacity = buffers[0].buffer_size
+        self.pos, self.full = 0, False
+        self.synchronize()
         self.columns: dict[str, np.ndarray] = {}
         for name in self.COLUMNS:
             parts = [getattr(buffer, name) for buffer in buffers]
@@ -65,6 +63,17 @@ class SeedStorage:
             self.columns[name][self.pos] = value
         self.pos = (self.pos + 1) % self.capacity
         self.full = self.full or self.pos == 0
+
+    def synchronize(self) -> None:
+        """Take over what the models' own buffers were given, demonstrations for example.
+
+        Raises:
+            ValueError: If they are filled differently.
+        """
+        if len({(buffer.pos, buffer.full) for buffer in self.buffers}) > 1:
+            sizes = [buffer.size() for buffer in self.buffers]
+            raise ValueError(f"replay buffers must be equally filled, got {sizes} transitions")
+        self.pos, self.full = self.buffers[0].pos, self.buffers[0].full
 
     def publish(self) -> None:
         """Tell the models' own buffers how full they are."""
@@ -132,9 +141,10 @@ class SeedNoise:
     def draw(self) -> th.Tensor:
         """Return the next numbers of every seed, (S, *shape)."""
         if self._next == AHEAD:
-            draw = th.rand if self.uniform else th.randn
+            # Uniform numbers become indices: float32 would miss some of a million rows.
+            draw, dtype = (th.rand, th.float64) if self.uniform else (th.randn, th.float32)
             self._pool = th.stack(
-                [draw(AHEAD, *self.shape, generator=generator) for generator in self.generators], 1
+                [draw(AHEAD, *self.shape, generator=own, dtype=dtype) for own in self.generators], 1
             )
             self._next = 0
         self._next += 1

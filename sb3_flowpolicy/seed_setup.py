@@ -1,0 +1,67 @@
+"""What a batch of seeds needs before it can start: fitting agents, environments, a progress bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from stable_baselines3.common import callbacks
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from sb3_flowpolicy.engine import why_unsupported
+from sb3_flowpolicy.sac_flow import SACFlow
+
+EnvFactory = Callable[[], gym.Env]
+
+
+def check_stackable(model: SACFlow) -> None:
+    """Raise ``ValueError`` if agents like this one cannot be trained in lockstep."""
+    reason = why_unsupported(model)
+    if reason is not None:
+        raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
+    assert isinstance(model.train_freq, TrainFreq)
+    if model.train_freq.unit is not TrainFrequencyUnit.STEP or model.gradient_steps < 0:
+        raise ValueError(
+            "train_freq must count steps and gradient_steps be at least 0 for seeds to stay in "
+            f"step, got {model.train_freq} and {model.gradient_steps}"
+        )
+    if model.action_noise is not None or model.device.type != "cpu":
+        raise ValueError(
+            "agents must collect on the CPU and without action_noise, got "
+            f"device {model.device} and action_noise {model.action_noise}"
+        )
+
+
+def make_env(env: str | EnvFactory) -> gym.Env:
+    """Make one environment from its id or factory."""
+    return gym.make(env) if isinstance(env, str) else env()
+
+
+def make_vec_env(env: str | EnvFactory, count: int) -> VectorEnv:
+    """Make the environment's own vectorised form, or ``count`` of them stepped one by one.
+
+    Either way an episode that ends is followed by the next one in the same step.
+    """
+    mode = AutoresetMode.SAME_STEP
+    if isinstance(env, str) and gym.spec(env).vector_entry_point is not None:
+        return gym.make_vec(
+            env,
+            num_envs=count,
+            vectorization_mode="vector_entry_point",
+            autoreset_mode=mode,
+        )
+    return SyncVectorEnv([partial(make_env, env)] * count, autoreset_mode=mode)
+
+
+def make_progress_bar(total: int) -> Any:
+    """Return the progress bar that SB3 uses.
+
+    Raises:
+        ImportError: If tqdm or rich is missing.
+    """
+    if callbacks.tqdm is None:
+        raise ImportError('the progress bar needs tqdm and rich: pip install "sb3_flowpolicy[zoo]"')
+    return callbacks.tqdm(total=total)
