@@ -152,6 +152,8 @@ class SACFlow(SAC):
         )
         planned = self._planned_updates(total_timesteps)
         self._worth_compiling = planned >= UPDATES_WORTH_COMPILING
+        if self._engine is not None:
+            self._engine.synchronize()
         return total_timesteps, callback
 
     def _sample_action(
@@ -162,7 +164,6 @@ class SACFlow(SAC):
         if self.num_timesteps < random_steps or engine is None or not engine.compiled:
             return super()._sample_action(random_steps, action_noise, n_envs)
         # What SB3 does, less what it spends on finding out that the observation is an array.
-        engine.synchronize()
         obs = th.as_tensor(self._last_obs, device=self.device)
         scaled = engine.act(obs.unsqueeze(0)).squeeze(0).cpu().numpy()
         scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
