@@ -109,6 +109,11 @@ class Engine:
         self._sample = sample
         self._compiled_sample = Compiled(sample, "the policy", device)
 
+    def _runs_compiled(self) -> bool:
+        """What could not be compiled once is not tried again, for the other function neither."""
+        broken = self._compiled_update.broken or self._compiled_sample.broken
+        return self.compiled and not broken
+
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
         return [
@@ -144,7 +149,7 @@ class Engine:
         if noise is None:
             shape = (*obs.shape[:2], self.networks.noise_dim)
             noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
-        if self.compiled:
+        if self._runs_compiled():
             return self._compiled_sample(obs.shape, actor, obs, noise)
         return self._sample(actor, obs, noise)
 
@@ -205,7 +210,7 @@ class Engine:
         history = []
         for k, batch in enumerate(batches):
             move_target = k % first.target_update_interval == 0
-            if self.compiled:
+            if self._runs_compiled():
                 key = (batch.noise.shape, move_target)
                 losses = self._compiled_update(key, state, batch, learning_rate, move_target)
             else:
