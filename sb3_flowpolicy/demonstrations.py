@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -69,18 +70,28 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     """
     if isinstance(source, Mapping):
         arrays = dict(source)
-    else:
-        if not Path(source).is_file():
-            raise ValueError(f"demonstrations must be an .npz file that exists, got {source!s}")
+    elif isinstance(source, str | Path) and zipfile.is_zipfile(source):
         with np.load(source, allow_pickle=False) as file:
             arrays = dict(file)
+    else:
+        raise ValueError(
+            f"demonstrations must be arrays or an .npz file that exists, got {source!r}"
+        )
     missing = [key for key in KEYS if key not in arrays]
     if missing:
         raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")
-    lengths = {key: len(arrays[key]) for key in KEYS}
+    arrays = {key: np.asarray(arrays[key]) for key in KEYS}
+    for key in ("rewards", "terminations", "truncations"):
+        arrays[key] = arrays[key].reshape(-1)
+    for key in ("terminations", "truncations"):
+        arrays[key] = arrays[key].astype(bool)
+    for key, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"demonstrations must be finite, got NaN or infinity in {key}")
+    lengths = {key: len(array) if array.ndim else 0 for key, array in arrays.items()}
     if len(set(lengths.values())) > 1 or not lengths["actions"]:
         raise ValueError(f"demonstrations must have equally many rows, at least 1, got {lengths}")
-    return {key: np.asarray(arrays[key]) for key in KEYS}
+    return arrays
 
 
 def fill_replay_buffer(
@@ -113,6 +124,23 @@ def fill_replay_buffer(
         raise ValueError(
             f"demonstrations must have between {buffer.n_envs} and "
             f"{buffer.n_envs * buffer.buffer_size} rows, got {len(demonstrations['actions'])}"
+        )
+    spaces = {
+        "observations": policy.observation_space,
+        "next_observations": policy.observation_space,
+        "actions": policy.action_space,
+    }
+    for key, space in spaces.items():
+        if demonstrations[key].shape[1:] != space.shape:
+            raise ValueError(
+                f"demonstrations must have {key} of shape (N, *{space.shape}), "
+                f"got {demonstrations[key].shape}"
+            )
+    scaled = policy.scale_action(demonstrations["actions"])
+    if np.abs(scaled).max() > 1 + 1e-5:
+        raise ValueError(
+            f"demonstrations must have actions within {policy.action_space}, got "
+            f"{demonstrations['actions'].min()} ... {demonstrations['actions'].max()}"
         )
     runs = {
         key: demonstrations[key][: per_env * buffer.n_envs]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,11 +20,13 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_flowpolicy import policies
 from sb3_flowpolicy.demonstrations import fill_replay_buffer, load_demonstrations
 from sb3_flowpolicy.engine import Engine, Losses, update_settings, why_unsupported
+from sb3_flowpolicy.policies.sac import check_finite_actions
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
 # Compiling takes 10 to 30 seconds and saves one to five milliseconds per update.
 UPDATES_WORTH_COMPILING = 10_000
+MOST_DRAWN_AT_ONCE = 1000
 
 SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
 
@@ -152,6 +155,10 @@ class SACFlow(SAC):
         )
         planned = self._planned_updates(total_timesteps)
         self._worth_compiling = planned >= UPDATES_WORTH_COMPILING
+        self._engine_refused = False
+        if self._engine is not None and why_unsupported(self) is not None:
+            self._engine.release()
+            self._engine = None
         if self._engine is not None:
             self._engine.synchronize()
         return total_timesteps, callback
@@ -166,6 +173,7 @@ class SACFlow(SAC):
         # What SB3 does, less what it spends on finding out that the observation is an array.
         obs = th.as_tensor(self._last_obs, device=self.device)
         scaled = engine.act(obs.unsqueeze(0)).squeeze(0).cpu().numpy()
+        check_finite_actions(scaled)
         scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
@@ -185,14 +193,22 @@ class SACFlow(SAC):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
         engine.synchronize()
-        losses = engine.train(engine.draw(gradient_steps, batch_size))
-        self._n_updates += gradient_steps
-        self.record_losses(losses)
+        # Minibatches are drawn for many updates at once, but not for all of an offline run.
+        for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
+            n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
+            losses = engine.train(engine.draw(n_updates, batch_size), start)
+            self._n_updates += n_updates
+            self.record_losses(losses)
 
     def record_losses(self, losses: Losses, seed: int = 0) -> None:
         """Record what SB3's ``train`` records: means over the last updates, of one seed."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for key, value in losses.of_seed(seed).items():
+            if not math.isfinite(value):
+                raise ValueError(
+                    f"{key} must be finite, got {value} at step {self.num_timesteps}: look for NaN "
+                    "in observations and rewards, or lower the learning rate"
+                )
             if key != "ent_coef_loss" or self.ent_coef_optimizer is not None:
                 self.logger.record(f"train/{key}", value)
 
@@ -203,7 +219,9 @@ class SACFlow(SAC):
         compiled = self._worth_compiling if self.compile == "auto" else bool(self.compile)
         engine = self._engine
         # Compiled once is compiled for good: there is nothing to gain by going back.
-        fits = engine is not None and (engine.compiled or not compiled)
+        fits = (
+            engine is not None and (engine.compiled or not compiled) and engine.belongs_to([self])
+        )
         settings = update_settings(self, self.critic_loss_coef) if fits else None
         if engine is not None and engine.settings == settings:
             return engine

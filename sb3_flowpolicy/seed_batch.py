@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.engine import Engine, Losses
+from sb3_flowpolicy.engine import Engine, Losses, update_settings
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
 from sb3_flowpolicy.seed_setup import (
+    CallbackFactory,
     EnvFactory,
+    check_seeds,
     check_stackable,
+    copy_callback,
     make_env,
     make_progress_bar,
     make_vec_env,
@@ -65,9 +68,7 @@ class SeedBatch:
         monitor_dir: str | Path | None = None,
         **kwargs: Any,
     ) -> None:
-        self.seeds = list(range(seeds)) if isinstance(seeds, int) else [int(s) for s in seeds]
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds must be different and at least one, got {seeds!r}")
+        self.seeds = check_seeds(seeds)
         models = [algorithm(policy, make_env(env), seed=seed, **kwargs) for seed in self.seeds]
         self._adopt(models, self.seeds, env, monitor_dir)
 
@@ -81,16 +82,22 @@ class SeedBatch:
         self.env, self.seeds, self._models = env, seeds, models
         first = models[0]
         check_stackable(first)
-        buffers = [model.replay_buffer for model in self._models]
-        self._storage = SeedStorage(buffers)  # type: ignore[arg-type]
+        self._storage = SeedStorage(self._buffers())
         self._engine: Engine | None = None
         self._episodes = SeedEpisodes(self._models, self.seeds, self._before_dump, monitor_dir)
         self._losses: Losses | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
+        self._noise = self._make_noise()
+
+    def _buffers(self) -> list[ReplayBuffer]:
+        return [model.replay_buffer for model in self._models if model.replay_buffer is not None]
+
+    def _make_noise(self) -> dict[str, SeedNoise]:
+        first = self._models[0]
         assert isinstance(first.actor, FlowActor)
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
-        self._noise = {
+        return {
             "random actions": SeedNoise(self.seeds, shape, 0, uniform=True),
             "actions": SeedNoise(self.seeds, (1, noise_dim), 1),
             "updates": SeedNoise(self.seeds, (2, first.batch_size, noise_dim), 2),
@@ -105,7 +112,7 @@ class SeedBatch:
     def learn(
         self,
         total_timesteps: int,
-        callback: BaseCallback | list[BaseCallback] | None = None,
+        callback: BaseCallback | list[BaseCallback] | CallbackFactory | None = None,
         log_interval: int | None = 4,
         tb_log_name: str = "SACFlow",
         reset_num_timesteps: bool = True,
@@ -115,8 +122,9 @@ class SeedBatch:
 
         Args:
             total_timesteps: Environment steps per agent.
-            callback: Callback, copied for each agent, whose ``locals`` hold ``rewards`` and
-                ``dones``; training stops when any copy says so.
+            callback: Callback, copied for each agent, or a function from a seed to a callback,
+                for those that write files: ``lambda seed: EvalCallback(env,
+                best_model_save_path=f"seed_{seed}")``. Training stops when any of them says so.
             log_interval: Episodes between two dumps of an agent's log.
             tb_log_name: Name of the TensorBoard runs, which get ``_seed<seed>`` appended.
             reset_num_timesteps: Whether to count from zero, or to go on.
@@ -153,10 +161,14 @@ class SeedBatch:
         frequency, total = first.train_freq.frequency, first._total_timesteps
         going = True
         while going and first.num_timesteps < total:
+            for one in callbacks:
+                one.on_rollout_start()
             collected = 0
             while going and collected < frequency:
                 going = self._step(callbacks, log_interval)
                 collected += 1
+            for one in callbacks:
+                one.on_rollout_end()
             if bar is not None:
                 bar.update(collected)
             if going and first.num_timesteps > first.learning_starts and first.gradient_steps:
@@ -221,27 +233,52 @@ class SeedBatch:
     def _start(
         self,
         total_timesteps: int,
-        callback: BaseCallback | list[BaseCallback] | None,
+        callback: BaseCallback | list[BaseCallback] | CallbackFactory | None,
         tb_log_name: str,
         reset_num_timesteps: bool,
     ) -> list[BaseCallback]:
         """Do what SB3's ``learn`` does first, for every agent."""
-        template = CallbackList(callback) if isinstance(callback, list) else callback
         callbacks = []
         for seed, model in zip(self.seeds, self._models, strict=True):
-            own = copy.deepcopy(template)
+            own = copy_callback(callback, seed)
             name = f"{tb_log_name}_seed{seed}"
             # SB3 draws the first observation from the model's own environment; ours are stepped.
             _, ready = model._setup_learn(total_timesteps, own, reset_num_timesteps, name)
             ready.on_training_start({"self": model}, {})
             callbacks += [ready] if own is not None else []
-        first = self._models[0]
-        compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
-        if self._engine is None or (compiled and not self._engine.compiled):
-            self._engine = Engine(self._models, first.critic_loss_coef, compiled)
-        self._engine.synchronize()
-        self._storage.synchronize()
+        self._take_over()
         return callbacks
+
+    def _take_over(self) -> None:
+        """Make engine, storage and noise fit what was done to the agents since the last run."""
+        first, models = self._models[0], self._models
+        check_stackable(first)
+        settings = update_settings(first, first.critic_loss_coef)
+        for model in models:
+            same = update_settings(model, model.critic_loss_coef) == settings
+            if not same or model.batch_size != first.batch_size:
+                raise ValueError("agents must all have the same settings, got different ones")
+        compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
+        engine = self._engine
+        if engine is not None:
+            compiled = compiled or engine.compiled
+            if not engine.belongs_to(models) or (engine.settings, engine.compiled) != (
+                settings,
+                compiled,
+            ):
+                engine.release()
+                self._engine = None
+        if self._engine is None:
+            self._engine = Engine(models, first.critic_loss_coef, compiled)
+        self._engine.synchronize()
+        buffers = self._buffers()
+        if any(
+            mine is not theirs for mine, theirs in zip(self._storage.buffers, buffers, strict=True)
+        ):
+            self._storage = SeedStorage(buffers)
+        self._storage.synchronize()
+        if self._noise["rows"].shape != (first.batch_size,):
+            self._noise = self._make_noise()
 
     def _step(self, callbacks: list[BaseCallback], log_interval: int | None) -> bool:
         """Step all environments once; return whether to go on."""
@@ -273,7 +310,9 @@ class SeedBatch:
         if callbacks:
             self._storage.publish()
             for seed, one in enumerate(callbacks):
-                one.update_locals({"rewards": rewards[[seed]], "dones": dones[[seed]]})
+                one.update_locals(
+                    {"rewards": rewards[[seed]], "dones": dones[[seed]], "infos": [{}]}
+                )
                 going = one.on_step() and going
         self._episodes.step(rewards, dones, infos, log_interval)
         return going

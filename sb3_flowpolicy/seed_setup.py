@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import operator
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from stable_baselines3.common import callbacks
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_flowpolicy.engine import why_unsupported
@@ -17,9 +21,45 @@ from sb3_flowpolicy.sac_flow import SACFlow
 EnvFactory = Callable[[], gym.Env]
 
 
+CallbackFactory = Callable[[int], BaseCallback]
+
+
+def check_seeds(seeds: int | Iterable[int]) -> list[int]:
+    """Return the seeds as a list.
+
+    Raises:
+        ValueError: If there are none, or they are not different integers of at least 0.
+    """
+    try:
+        # A number of seeds, numpy's integers included, or the seeds themselves.
+        listed = (
+            [operator.index(seed) for seed in seeds]
+            if isinstance(seeds, Iterable)
+            else list(range(operator.index(seeds)))
+        )
+    except TypeError as error:
+        raise ValueError(f"seeds must be integers, got {seeds!r}") from error
+    if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
+        raise ValueError(f"seeds must be different, at least 0 and at least one, got {seeds!r}")
+    return listed
+
+
+def copy_callback(
+    callback: BaseCallback | list[BaseCallback] | CallbackFactory | None, seed: int
+) -> BaseCallback | None:
+    """Return one agent's own callback: callbacks hold the state of the agent they watch."""
+    if isinstance(callback, BaseCallback):
+        return copy.deepcopy(callback)
+    if isinstance(callback, list):
+        return callbacks.CallbackList(copy.deepcopy(callback))
+    return None if callback is None else callback(seed)
+
+
 def check_stackable(model: SACFlow) -> None:
     """Raise ``ValueError`` if agents like this one cannot be trained in lockstep."""
     reason = why_unsupported(model)
+    if reason is None and is_image_space(model.observation_space):
+        reason = "image observations"
     if reason is not None:
         raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
     assert isinstance(model.train_freq, TrainFreq)

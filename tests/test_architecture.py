@@ -20,7 +20,6 @@ FLOORS = [
     "seed_episodes",
     "seed_setup",
     "seed_batch",
-    "benchmarks",
     "hyperparameters",
     "train_seeds",
     "benchmarks",

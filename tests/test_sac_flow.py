@@ -131,7 +131,7 @@ def test_loaded_model_needs_no_demonstrations(tmp_path: Path) -> None:
         ({"random_steps": -1}, "random_steps must be at least 0, got -1"),
         ({"critic_loss_coef": 0.0}, "critic_loss_coef must be above 0, got 0.0"),
         ({"critic_loss_coef": float("nan")}, "critic_loss_coef must be above 0, got nan"),
-        ({"demonstrations": "nowhere.npz"}, "an .npz file that exists, got nowhere.npz"),
+        ({"demonstrations": "nowhere.npz"}, "an .npz file that exists, got 'nowhere.npz'"),
         ({"demonstrations": {"actions": np.zeros(3)}}, r"demonstrations must have the arrays"),
         ({"policy": "NoPolicy"}, "NoPolicy unknown"),
         ({"policy_kwargs": {"distribution": "nvp"}}, "distribution must be one of"),
@@ -166,6 +166,33 @@ def test_demonstrations_that_do_not_fit() -> None:
         other.add_demonstrations(demos())
     with pytest.raises(ValueError, match="n_steps must be at least 1, got 0"):
         record_demonstrations(gym.make("Pendulum-v1"), lambda obs: np.zeros(1), 0)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("observations", lambda rows: rows[:, :1], r"observations of shape \(N, \*\(3,\)\), got"),
+        ("actions", lambda rows: rows * 100, r"actions within Box.*got 50.0 \.\.\. 50.0"),
+        ("rewards", lambda rows: rows * np.nan, "finite, got NaN or infinity in rewards"),
+    ],
+)
+def test_demonstrations_are_checked(key: str, change: Any, message: str) -> None:
+    rows = demos()
+    rows[key] = change(rows[key])
+    with pytest.raises(ValueError, match=message):
+        SACFlow("FlowPolicy", "Pendulum-v1", **FAST).add_demonstrations(rows)
+
+
+@pytest.mark.parametrize("dtype", [bool, int, np.uint8, float])
+def test_flags_of_any_type_mean_the_same(dtype: type) -> None:
+    rows = demos()
+    rows["terminations"] = np.zeros(40, dtype=dtype)
+    rows["terminations"][-1] = 1
+    rows["truncations"] = np.zeros(40, dtype=dtype)
+    model = SACFlow("FlowPolicy", "Pendulum-v1", **FAST)
+    model.add_demonstrations(rows)
+    buffer = buffer_of(model)
+    assert (buffer.dones[39, 0], buffer.timeouts[39, 0]) == (1.0, 0.0)
 
 
 def test_stock_sac_models_load() -> None:

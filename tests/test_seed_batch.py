@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.envs import IdentityEnvBox
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.noise import NormalActionNoise
@@ -192,6 +192,35 @@ def test_demonstrations_come_first() -> None:
         assert np.array_equal(model.replay_buffer.observations[:25, 0], demos["observations"])
 
 
+def test_what_was_done_to_the_agents_in_between_is_kept(tmp_path: Path) -> None:
+    batch = SeedBatch("FlowPolicy", ENV, 2, **FAST).learn(50)
+    for model in batch.models:
+        model.tau, model.batch_size = 1.0, 8
+        model.learn(20, reset_num_timesteps=False)
+        model.save_replay_buffer(tmp_path / "buffer")
+        model.load_replay_buffer(tmp_path / "buffer")
+    batch.learn(30, reset_num_timesteps=False)
+    for model in batch.models:
+        assert model.replay_buffer is not None
+        assert model.replay_buffer.size() == 100
+        steps = {float(state["step"]) for state in model.actor.optimizer.state.values()}
+        assert steps == {float(model._n_updates)}
+        critic, target = model.critic.state_dict(), model.critic_target.state_dict()
+        assert all(th.equal(target[key], value) for key, value in critic.items())
+    batch.models[0].tau = 0.5
+    with pytest.raises(ValueError, match="agents must all have the same settings"):
+        batch.learn(10, reset_num_timesteps=False)
+
+
+def test_callbacks_that_write_files_get_their_seed(tmp_path: Path) -> None:
+    batch = SeedBatch("FlowPolicy", ENV, [4, 5], **FAST)
+    batch.learn(
+        40, callback=lambda seed: CheckpointCallback(20, str(tmp_path), name_prefix=f"seed{seed}")
+    )
+    names = {path.name for path in tmp_path.glob("*_40_steps.zip")}
+    assert names == {"seed4_40_steps.zip", "seed5_40_steps.zip"}
+
+
 class StopAt(BaseCallback):
     """Stops a run, and notes what it was shown."""
 
@@ -227,8 +256,10 @@ def test_learns_what_a_single_agent_learns() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"seeds": 0}, "seeds must be different and at least one, got 0"),
-        ({"seeds": [1, 1]}, r"seeds must be different and at least one, got \[1, 1\]"),
+        ({"seeds": 0}, "seeds must be different, at least 0 and at least one, got 0"),
+        ({"seeds": [1, 1]}, r"seeds must be different.*got \[1, 1\]"),
+        ({"seeds": [-3]}, r"at least 0 and at least one, got \[-3\]"),
+        ({"seeds": [0.2, 1.9]}, r"seeds must be integers, got \[0.2, 1.9\]"),
         ({"train_freq": (1, "episode")}, "train_freq must count steps"),
         ({"gradient_steps": -1}, "gradient_steps be at least 0"),
         ({"n_steps": 3}, "replay buffers must be plain ReplayBuffers, got NStepReplayBuffer"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch as th
-from torch.utils.hooks import RemovableHandle
 
 from sb3_flowpolicy.engine.flat import FlatParameters
 
@@ -48,34 +47,26 @@ class FlatAdam:
         self.settings = settings
         self.flat = flat
         self.optimizers = optimizers
-        self._hooks: list[RemovableHandle] = []
         self._addresses: list[tuple[th.optim.Optimizer, th.Tensor, int]] = []
         self.bind()
 
     def bind(self) -> None:
         """Take over the optimisers' states and make them views of ours."""
-        self.release()
-        # Whoever saves a checkpoint gets step counts that are up to date.
-        self._hooks = [
-            optimizer.register_state_dict_pre_hook(lambda _: self.publish_steps())
-            for optimizer in self.optimizers
-        ]
         data = self.flat.data
         self.mean, self.square = th.zeros_like(data), th.zeros_like(data)
-        #: Number of steps taken, (S, 1): float64, as 1 - 0.999^t needs its digits.
-        self.step = th.zeros(len(data), 1, dtype=th.float64, device=data.device)
+        # One count per parameter, as in torch.optim, though they never differ.
+        n_owners = len(self.flat.views(data, 0))
+        self.step = th.zeros(len(data), n_owners, device=data.device)
         self._addresses = []
         for seed, optimizer in enumerate(self.optimizers):
-            pairs = zip(
-                self.flat.views(self.mean, seed), self.flat.views(self.square, seed), strict=True
-            )
-            for (owner, mean), (_, square) in pairs:
+            pairs = self.flat.views(self.mean, seed), self.flat.views(self.square, seed)
+            for step, (owner, mean), (_, square) in zip(self.step[seed], *pairs, strict=True):
                 state = optimizer.state[owner]
                 if state:
+                    step.copy_(state["step"])
                     mean.copy_(state["exp_avg"])
                     square.copy_(state["exp_avg_sq"])
-                    self.step[seed] = float(state["step"])
-                state.update(step=th.tensor(0.0), exp_avg=mean, exp_avg_sq=square)
+                state.update(step=step, exp_avg=mean, exp_avg_sq=square)
                 self._addresses.append((optimizer, owner, mean.data_ptr()))
 
     def is_bound(self) -> bool:
@@ -85,25 +76,13 @@ class FlatAdam:
             for optimizer, owner, address in self._addresses
         )
 
-    def publish_steps(self) -> None:
-        """Write the step counts where ``torch.optim`` keeps them: one small tensor each."""
-        if not self.is_bound():
-            return  # what was loaded since is newer than what we know
-        for optimizer, step in zip(self.optimizers, self.step[:, 0].tolist(), strict=True):
-            for state in optimizer.state.values():
-                state["step"].fill_(step)
-
     def release(self) -> None:
         """Give the optimisers memory of their own again."""
-        self.publish_steps()
-        for hook in self._hooks:
-            hook.remove()
         for optimizer, owner, _ in self._addresses:
             state = optimizer.state[owner]
-            for key in ("exp_avg", "exp_avg_sq"):
+            for key in ("step", "exp_avg", "exp_avg_sq"):
                 if key in state:
                     state[key] = state[key].clone()
-        self._hooks, self._addresses = [], []
 
 
 def adam_step(
@@ -122,7 +101,7 @@ def adam_step(
         gradient: Their gradient, (S, P).
         mean: First moments, (S, P).
         square: Second moments, (S, P).
-        step: Steps taken so far, (S, 1), float64.
+        step: Steps taken so far, (S, number of parameters), all the same.
         learning_rate: Learning rate, 0-dimensional, float64.
         settings: Betas, epsilon and weight decay.
 
@@ -134,6 +113,8 @@ def adam_step(
         2019).
     """
     step = step + 1
+    # float64, because 1 - 0.999^t needs its digits.
+    count = step[:, :1].double()
     dtype = parameters.dtype
     if settings.weight_decay and settings.decoupled:
         parameters = parameters * (1 - learning_rate * settings.weight_decay).to(dtype)
@@ -141,7 +122,7 @@ def adam_step(
         gradient = gradient + settings.weight_decay * parameters
     mean = mean + (1 - settings.beta1) * (gradient - mean)
     square = settings.beta2 * square + (1 - settings.beta2) * gradient * gradient
-    step_size = (learning_rate / (1 - settings.beta1**step)).to(dtype)
-    correction = (1 - settings.beta2**step).sqrt().to(dtype)
+    step_size = (learning_rate / (1 - settings.beta1**count)).to(dtype)
+    correction = (1 - settings.beta2**count).sqrt().to(dtype)
     parameters = parameters - step_size * mean / (square.sqrt() / correction + settings.eps)
     return parameters, mean, square, step

@@ -24,6 +24,13 @@ from sb3_flowpolicy.engine.update import (
 )
 from sb3_flowpolicy.policies import FlowActor
 
+# Layers that behave differently in training, or draw random numbers of their own.
+_MODE_DEPENDENT = (
+    nn.modules.batchnorm._BatchNorm,
+    nn.modules.dropout._DropoutNd,
+    nn.RReLU,
+)
+
 
 def why_unsupported(model: SAC) -> str | None:
     """Say what about a model the engine cannot do; None if it can do everything."""
@@ -37,11 +44,22 @@ def why_unsupported(model: SAC) -> str | None:
     if any(True for _ in policy.critic_target.features_extractor.parameters()):
         return "features extractor with parameters"
     for module in policy.modules():
-        if isinstance(module, nn.modules.batchnorm._BatchNorm | nn.modules.dropout._DropoutNd):
+        if isinstance(module, _MODE_DEPENDENT):
             return f"layer of type {type(module).__name__}"
+    for network in policy.critic.q_networks:
+        for layer in network.children():
+            if not isinstance(layer, nn.Linear) and any(True for _ in layer.parameters()):
+                return f"critic layer of type {type(layer).__name__}, which has parameters"
+    if any(True for _ in policy.critic.buffers()):
+        return "critic with buffers"
+    for parameter in (*policy.actor.parameters(), *policy.critic.parameters()):
+        if not parameter.requires_grad or parameter._backward_hooks:
+            return "parameters that are frozen or have hooks"
     for optimizer in (policy.actor.optimizer, policy.critic.optimizer):
         if adam_settings(optimizer) is None:
             return f"optimizer of type {type(optimizer).__name__} with these settings"
+        if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
+            return "optimizer with hooks"
     return None
 
 
@@ -98,6 +116,7 @@ class Engine:
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
         self.settings = update_settings(first, critic_loss_coef)
+        self._identities = [_identity(model) for model in self.models]
         self._update = make_update(self.networks, self.settings)
         device = self.networks.actor.data.device
         self._compiled_update = Compiled(self._update, "the SAC update", device)
@@ -113,6 +132,14 @@ class Engine:
         """What could not be compiled once is not tried again, for the other function neither."""
         broken = self._compiled_update.broken or self._compiled_sample.broken
         return self.compiled and not broken
+
+    def belongs_to(self, models: Sequence[SAC]) -> bool:
+        """Whether these still are the models, down to their networks and optimisers."""
+        return all(
+            now is then
+            for new, old in zip(models, self._identities, strict=True)
+            for now, then in zip(_identity(new), old, strict=True)
+        )
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
@@ -180,7 +207,8 @@ class Engine:
             assert model.replay_buffer is not None
             sampled = sample_transitions(
                 model.replay_buffer,
-                n_updates * batch_size,
+                n_updates,
+                batch_size,
                 model.gamma,
                 model.get_vec_normalize_env(),
             )
@@ -194,28 +222,48 @@ class Engine:
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
         return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
 
-    def train(self, batches: Sequence[Batch]) -> Losses:
+    def train(self, batches: Sequence[Batch], start: int = 0) -> Losses:
         """Perform one update of all models per batch.
 
         Args:
             batches: As :meth:`draw` returns them, at least one.
+            start: Number of updates done already since the target networks' turn was counted.
 
         Returns:
             Means over the updates, per model.
         """
         first = self.models[0]
-        rate = first.policy.actor.optimizer.param_groups[0]["lr"]
-        learning_rate = th.tensor(rate, dtype=th.float64, device=self.networks.actor.data.device)
+        optimizers = [first.actor.optimizer, first.critic.optimizer]
+        # A fixed temperature takes no steps, at whatever rate.
+        optimizers.append(first.ent_coef_optimizer or first.actor.optimizer)
+        rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
+        device = self.networks.actor.data.device
+        learning_rates = th.tensor(rates, dtype=th.float64, device=device)
         state = self.state()
         history = []
-        for k, batch in enumerate(batches):
+        for k, batch in enumerate(batches, start):
             move_target = k % first.target_update_interval == 0
             if self._runs_compiled():
                 key = (batch.noise.shape, move_target)
-                losses = self._compiled_update(key, state, batch, learning_rate, move_target)
+                losses = self._compiled_update(key, state, batch, learning_rates, move_target)
             else:
-                losses = self._update(state, batch, learning_rate, move_target)
+                losses = self._update(state, batch, learning_rates, move_target)
             history.append(losses)
         if len(history) == 1:
             return history[0]
         return Losses(*(th.stack(parts).mean(0) for parts in zip(*history, strict=True)))
+
+
+def _identity(model: SAC) -> tuple[object, ...]:
+    """What an engine holds on to: if one of these is replaced, it works on orphans."""
+    return (
+        model.policy,
+        model.actor.optimizer,
+        model.critic.optimizer,
+        model.ent_coef_optimizer,
+        model.log_ent_coef,
+        # Parameters are replaced all at once, by load_state_dict(assign=True) for example.
+        next(model.actor.parameters()),
+        next(model.critic.parameters()),
+        next(model.critic_target.parameters()),
+    )

@@ -10,9 +10,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 
 def sample_transitions(
-    buffer: ReplayBuffer, n: int, gamma: float, env: VecNormalize | None = None
+    buffer: ReplayBuffer,
+    n_updates: int,
+    batch_size: int,
+    gamma: float,
+    env: VecNormalize | None = None,
 ) -> tuple[th.Tensor, ...]:
-    """Draw ``n`` transitions, with the random numbers that SB3's own sampling would take.
+    """Draw minibatches, with the random numbers that SB3's own sampling would take.
 
     A plain buffer on the CPU is read through tensors that share its memory, one gather per
     column for all updates of a ``train()`` call. Any other buffer (n-step, HER, memory-saving)
@@ -20,18 +24,19 @@ def sample_transitions(
 
     Args:
         buffer: SB3's replay buffer, not empty.
-        n: Number of transitions: updates times batch size.
+        n_updates: Number of minibatches.
+        batch_size: Transitions per minibatch.
         gamma: Discount factor, where the buffer does not bring its own.
         env: ``VecNormalize`` that normalises observations and rewards.
 
     Returns:
         Observations, actions, next observations, dones, rewards and discounts on the buffer's
-        device, with n rows; the last three of shape (n,).
+        device, with n_updates x batch_size rows; the last three one-dimensional.
     """
     plain = type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage and env is None
     if plain and buffer.device.type == "cpu":
-        return _gather(buffer, n, gamma)
-    samples: ReplayBufferSamples = buffer.sample(n, env=env)
+        return _gather(buffer, n_updates, batch_size, gamma)
+    samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
     discounts = samples.discounts
     if discounts is None:
         discounts = th.full_like(samples.rewards, gamma)
@@ -45,11 +50,20 @@ def sample_transitions(
     )
 
 
-def _gather(buffer: ReplayBuffer, n: int, gamma: float) -> tuple[th.Tensor, ...]:
-    # SB3's buffers draw from numpy's global generator: rows first, then environments.
-    rows = np.random.randint(0, buffer.size(), size=n)  # noqa: NPY002
-    if buffer.n_envs > 1:
-        rows = rows * buffer.n_envs + np.random.randint(0, buffer.n_envs, size=n)  # noqa: NPY002
+def _gather(
+    buffer: ReplayBuffer, n_updates: int, batch_size: int, gamma: float
+) -> tuple[th.Tensor, ...]:
+    # SB3's buffers draw from numpy's global generator: rows, then environments, per minibatch.
+    draw = np.random.randint
+    if buffer.n_envs == 1:
+        rows = draw(0, buffer.size(), size=n_updates * batch_size)
+    else:
+        parts = [
+            draw(0, buffer.size(), size=batch_size) * buffer.n_envs
+            + draw(0, buffer.n_envs, size=batch_size)
+            for _ in range(n_updates)
+        ]
+        rows = np.concatenate(parts)
     index = th.from_numpy(rows)
 
     def take(array: np.ndarray) -> th.Tensor:

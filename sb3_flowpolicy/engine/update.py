@@ -13,7 +13,7 @@ from sb3_flowpolicy.engine.networks import StackedNetworks
 
 
 class Moments(NamedTuple):
-    """State of one Adam: first and second moments (S, P) and step counts (S, 1)."""
+    """State of one Adam: first and second moments (S, P) and step counts, see ``FlatAdam``."""
 
     mean: th.Tensor
     square: th.Tensor
@@ -70,7 +70,7 @@ class UpdateSettings:
     ent_coef_adam: AdamSettings | None  # None: the temperature is fixed
 
 
-# (state, batch, learning rate, whether to move the target networks) -> losses
+# (state, batch, learning rates, whether to move the target networks) -> losses
 Update = Callable[[TrainState, Batch, th.Tensor, bool], Losses]
 
 
@@ -89,14 +89,15 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         settings: Constants of the update.
 
     Returns:
-        Function of (state, batch, learning rate, whether to move the target networks).
+        Function of (state, batch, learning rates of actor, critics and temperature, whether to
+        move the target networks).
 
     References:
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.
     """
 
     def update(
-        state: TrainState, batch: Batch, learning_rate: th.Tensor, move_target: bool
+        state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
     ) -> Losses:
         actor = state.actor.detach().requires_grad_()
         actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
@@ -113,7 +114,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
             assert state.ent_coef_moments is not None
             moments = state.ent_coef_moments
             stepped = adam_step(
-                state.temperature, -surplus, *moments, learning_rate, settings.ent_coef_adam
+                state.temperature, -surplus, *moments, learning_rates[2], settings.ent_coef_adam
             )
             for old, new in zip((state.temperature, *moments), stepped, strict=True):
                 old.copy_(new)
@@ -133,14 +134,14 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         # Seeds do not share parameters: the gradient of the sum is each seed's own.
         (gradient,) = th.autograd.grad(critic_loss.sum(), critic)
         new_critic, *critic_moments = adam_step(
-            state.critic, gradient, *state.critic_moments, learning_rate, settings.critic_adam
+            state.critic, gradient, *state.critic_moments, learning_rates[1], settings.critic_adam
         )
 
         q_pi = networks.q_values(new_critic, batch.obs, actions_pi).amin(1)
         actor_loss = (ent_coef * log_prob - q_pi).mean(-1)
         (gradient,) = th.autograd.grad(actor_loss.sum(), actor)
         new_actor, *actor_moments = adam_step(
-            state.actor, gradient, *state.actor_moments, learning_rate, settings.actor_adam
+            state.actor, gradient, *state.actor_moments, learning_rates[0], settings.actor_adam
         )
 
         if move_target:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -13,7 +14,7 @@ from stable_baselines3.common.torch_layers import (
     FlattenExtractor,
     NatureCNN,
 )
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_flowpolicy.policies.actor import FlowActor
@@ -55,8 +56,11 @@ class DistributionPolicy(SACPolicy):
             isinstance(action_space, spaces.Box)
             and np.isfinite([action_space.low, action_space.high]).all()
         )
+        bounded = bounded and (action_space.low < action_space.high).all()
         if not bounded:
-            raise ValueError(f"action_space must be a Box with finite bounds, got {action_space}")
+            raise ValueError(
+                f"action_space must be a Box with finite bounds, low < high, got {action_space}"
+            )
         # Plain attributes before super().__init__(), which builds the actor.
         self.distribution = self.default_distribution if distribution is None else distribution
         self.distribution_kwargs = dict(distribution_kwargs or {})
@@ -82,6 +86,11 @@ class DistributionPolicy(SACPolicy):
         )
         return actor.to(self.device)
 
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        actions = super()._predict(observation, deterministic)
+        check_finite_actions(actions.detach().cpu().numpy())
+        return actions
+
     def set_training_mode(self, mode: bool) -> None:
         """Switch batch normalisation and dropout; ``predict`` asks for it at every step."""
         # Walking through all modules each time would take longer than a small network does.
@@ -97,6 +106,14 @@ class DistributionPolicy(SACPolicy):
             share_features_extractor=self.share_features_extractor,
         )
         return data
+
+
+def check_finite_actions(actions: np.ndarray) -> None:
+    """Raise ``ValueError`` rather than send NaN to an environment, as stock SAC does."""
+    if np.isnan(actions).any():
+        raise ValueError(
+            "observation and weights must be finite for an action to be, got actions with NaN"
+        )
 
 
 class GaussPolicy(DistributionPolicy):

@@ -132,7 +132,9 @@ def test_bad_arguments(kwargs: dict, message: str) -> None:
 
 @pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.Box(-np.inf, np.inf, (2,))])
 def test_bad_action_spaces(space: spaces.Space) -> None:
-    with pytest.raises(ValueError, match="action_space must be a Box with finite bounds, got"):
+    with pytest.raises(
+        ValueError, match="action_space must be a Box with finite bounds, low < high, got"
+    ):
         FlowPolicy(OBS, space, lambda _: 1e-3)  # type: ignore[arg-type]
 
 

@@ -182,11 +182,10 @@ def test_policy_aliases_name_their_class() -> None:
         assert getattr(policies, policy_class.__name__) is policy_class
 
 
-CASES: dict[str, tuple[str, str, dict]] = {
-    "realnvp": ("FlowPolicy", "Pendulum-v1", {"layers": 3, "hidden": [6, 5], "init": "default"}),
-    "low_rank": ("LowRankPolicy", "Pendulum-v1", {"rank": 1}),
-    "gaussian": ("GaussPolicy", "Pendulum-v1", {}),
-    "full_covariance": ("FlowPolicy", "Pendulum-v1", {}),
+# Arguments other than the defaults, for the densities that have any.
+UNUSUAL: dict[str, dict] = {
+    "realnvp": {"layers": 3, "hidden": [6, 5], "init": "default"},
+    "low_rank": {"rank": 1},
 }
 IN_A_NEW_PROCESS = """
 import sys, json, numpy as np, torch as th
@@ -210,12 +209,14 @@ for path in sorted(folder.glob("*.zip")):
 
 def test_saved_models_predict_the_same_in_a_new_process(tmp_path: Path) -> None:
     """Every policy class, every density, other than default arguments; the policy alone too."""
-    assert set(CASES) == set(registered_distributions()) - {"sharp"}
     models: dict[str, SACFlow] = {}
-    for name, (policy, env_id, kwargs) in CASES.items():
-        policy_kwargs = {**NET, "distribution": name, "distribution_kwargs": kwargs}
-        policy_kwargs["share_features_extractor"] = True
-        models[name] = SACFlow(policy, env_id, policy_kwargs=policy_kwargs, **FAST).learn(30)
+    for name, distribution_class in registered_distributions().items():
+        if not distribution_class.__module__.startswith("sb3_flowpolicy.distributions"):
+            continue  # registered by a test or a doctest: the new process does not know it
+        policy_kwargs = {**NET, "distribution": name, "share_features_extractor": True}
+        policy_kwargs["distribution_kwargs"] = UNUSUAL.get(name, {})
+        model = SACFlow("FlowPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, **FAST)
+        models[name] = model.learn(30)
     image = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=False)
     multi = SimpleMultiObsEnv(discrete_actions=False, random_start=False)
     for kind in ("Gauss", "LowRank", "Flow"):
