@@ -76,7 +76,7 @@ def make_distribution(
     Raises:
         ValueError: If the name or a keyword argument is unknown.
     """
-    if name not in _REGISTRY:
+    if not isinstance(name, str) or name not in _REGISTRY:
         raise ValueError(f"distribution must be one of {sorted(_REGISTRY)}, got {name!r}")
     parameters = inspect.signature(_REGISTRY[name]).parameters
     accepted = [p for p in parameters if p not in ("action_dim", "context_dim")]

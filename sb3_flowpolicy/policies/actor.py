@@ -15,6 +15,7 @@ from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.distributions.base import positive_int
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # What `density.base.` would prefix in a state dict lives at the actor's own level instead, as
@@ -153,9 +154,24 @@ class FlowActor(Actor):
 
         Returns:
             Log-density in nats, shape (batch,).
+
+        Raises:
+            ValueError: If there is not one action per observation, or one is outside [-1, 1]
+                (``policy.scale_action`` brings an environment's actions there).
         """
-        action = action.reshape(-1, self.density.action_dim)
-        return self.density.log_prob(self.context(obs), action)
+        context = self.context(obs)
+        action = th.as_tensor(action, dtype=context.dtype, device=context.device)
+        if action.numel() != len(context) * self.density.action_dim:
+            raise ValueError(
+                f"action must have shape ({len(context)}, {self.density.action_dim}), "
+                f"got {tuple(action.shape)}"
+            )
+        if (action.detach().abs() > 1 + 1e-4).any():
+            raise ValueError(
+                "action must be scaled to [-1, 1], got values between "
+                f"{action.min().item():.3g} and {action.max().item():.3g}"
+            )
+        return self.density.log_prob(context, action.reshape(len(context), -1))
 
     @th.no_grad()
     def entropy(self, obs: PyTorchObs, n_samples: int = 64) -> th.Tensor:
@@ -163,13 +179,13 @@ class FlowActor(Actor):
 
         Args:
             obs: Batch of observations.
-            n_samples: Number of samples per observation.
+            n_samples: Number of samples per observation, at least 1.
 
         Returns:
             Entropy in nats, shape (batch,); at most D log 2, that of the uniform distribution.
         """
         context = self.context(obs)
-        noise = self.draw_noise(context, n_samples)
+        noise = self.draw_noise(context, positive_int("n_samples", n_samples))
         return -self.density.rsample_and_log_prob(context, noise)[1].mean(0)
 
     @th.no_grad()

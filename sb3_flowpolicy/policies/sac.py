@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -18,6 +19,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_flowpolicy.policies.actor import FlowActor
+
+_SAC_POLICY_KWARGS = set(inspect.signature(SACPolicy.__init__).parameters)
 
 
 class DistributionPolicy(SACPolicy):
@@ -63,7 +66,15 @@ class DistributionPolicy(SACPolicy):
             )
         # Plain attributes before super().__init__(), which builds the actor.
         self.distribution = self.default_distribution if distribution is None else distribution
+        if not isinstance(distribution_kwargs, Mapping | None):
+            raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
         self.distribution_kwargs = dict(distribution_kwargs or {})
+        unknown = sorted(set(sac_policy_kwargs) - _SAC_POLICY_KWARGS)
+        if unknown:
+            raise ValueError(
+                f"policy_kwargs must be SACPolicy's, distribution or distribution_kwargs, got "
+                f"{unknown}; arguments of the density go into distribution_kwargs"
+            )
         if sac_policy_kwargs.get("use_sde") and self.distribution != "gaussian":
             raise ValueError(
                 "use_sde must be False unless distribution is 'gaussian': gSDE is a linear noise "

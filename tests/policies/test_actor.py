@@ -122,6 +122,9 @@ def test_sb3_distribution_interface(actor: FlowActor) -> None:
         ({"distribution": "nvp"}, "distribution must be one of"),
         ({"distribution_kwargs": {"layer": 2}}, 'distribution_kwargs of "realnvp" must be among'),
         ({"distribution": "low_rank", "distribution_kwargs": {"rank": 3}}, "rank must be at most"),
+        ({"layers": 2}, r"got \['layers'\]; arguments of the density go into distribution_kwargs"),
+        ({"distribution_kwargs": "layers=4"}, "distribution_kwargs must be a dict, got 'layers=4'"),
+        ({"distribution": ["realnvp"]}, "distribution must be one of"),
         ({"use_sde": True}, "use_sde must be False unless distribution is 'gaussian'"),
     ],
 )
@@ -136,6 +139,18 @@ def test_bad_action_spaces(space: spaces.Space) -> None:
         ValueError, match="action_space must be a Box with finite bounds, low < high, got"
     ):
         FlowPolicy(OBS, space, lambda _: 1e-3)  # type: ignore[arg-type]
+
+
+def test_actions_to_score_must_fit() -> None:
+    actor = make(FlowPolicy)
+    with pytest.raises(ValueError, match=r"action must have shape \(3, 2\), got \(6, 1, 2\)"):
+        actor.log_prob(th.zeros(3, 3), th.zeros(6, 1, 2))
+    with pytest.raises(ValueError, match=r"action must be scaled to \[-1, 1\], got.*1.9"):
+        actor.log_prob(th.zeros(1, 3), th.tensor([[0.0, 1.9]]))
+    scored = actor.log_prob(th.zeros(1, 3), np.array([[0.5, 1.0]]))  # type: ignore[arg-type]
+    assert scored.isfinite().all()
+    with pytest.raises(ValueError, match="n_samples must be an integer >= 1, got 0"):
+        actor.entropy(th.zeros(1, 3), 0)
 
 
 def test_a_density_must_not_hide_the_actor(monkeypatch: pytest.MonkeyPatch) -> None:
