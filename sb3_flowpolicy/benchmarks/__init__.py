@@ -1,0 +1,1 @@
+"""How fast updates, learning, environments and flows are, next to their peers."""
