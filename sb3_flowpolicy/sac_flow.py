@@ -19,7 +19,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
 from sb3_flowpolicy.demonstrations import fill_replay_buffer, load_demonstrations
-from sb3_flowpolicy.engine import Engine, Losses, update_settings, why_unsupported
+from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
 from sb3_flowpolicy.policies.sac import check_finite_actions
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
@@ -200,10 +200,14 @@ class SACFlow(SAC):
             self._n_updates += n_updates
             self.record_losses(losses)
 
-    def record_losses(self, losses: Losses, seed: int = 0) -> None:
-        """Record what SB3's ``train`` records: means over the last updates, of one seed."""
+    def record_losses(self, losses: th.Tensor, seed: int = 0) -> None:
+        """Record what SB3's ``train`` records: the engine's losses (4, S), of one seed.
+
+        Raises:
+            ValueError: If one of them is not finite.
+        """
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for key, value in losses.of_seed(seed).items():
+        for key, value in zip(LOSSES, losses[:, seed].tolist(), strict=True):
             if not math.isfinite(value):
                 raise ValueError(
                     f"{key} must be finite, got {value} at step {self.num_timesteps}: look for NaN "
@@ -219,11 +223,12 @@ class SACFlow(SAC):
         compiled = self._worth_compiling if self.compile == "auto" else bool(self.compile)
         engine = self._engine
         # Compiled once is compiled for good: there is nothing to gain by going back.
-        fits = (
-            engine is not None and (engine.compiled or not compiled) and engine.belongs_to([self])
-        )
-        settings = update_settings(self, self.critic_loss_coef) if fits else None
-        if engine is not None and engine.settings == settings:
+        if (
+            engine is not None
+            and (engine.compiled or not compiled)
+            and engine.settings_key == settings_key(self, self.critic_loss_coef)
+            and engine.belongs_to([self])
+        ):
             return engine
         if engine is not None:
             engine.release()

@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.engine import Engine, Losses, update_settings
+from sb3_flowpolicy.engine import Engine, settings_key
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
@@ -85,7 +85,7 @@ class SeedBatch:
         self._storage = SeedStorage(self._buffers())
         self._engine: Engine | None = None
         self._episodes = SeedEpisodes(self._models, self.seeds, self._before_dump, monitor_dir)
-        self._losses: Losses | None = None
+        self._losses: th.Tensor | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
         self._noise = self._make_noise()
@@ -253,16 +253,16 @@ class SeedBatch:
         """Make engine, storage and noise fit what was done to the agents since the last run."""
         first, models = self._models[0], self._models
         check_stackable(first)
-        settings = update_settings(first, first.critic_loss_coef)
+        settings = settings_key(first, first.critic_loss_coef)
         for model in models:
-            same = update_settings(model, model.critic_loss_coef) == settings
+            same = settings_key(model, model.critic_loss_coef) == settings
             if not same or model.batch_size != first.batch_size:
                 raise ValueError("agents must all have the same settings, got different ones")
         compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
         engine = self._engine
         if engine is not None:
             compiled = compiled or engine.compiled
-            if not engine.belongs_to(models) or (engine.settings, engine.compiled) != (
+            if not engine.belongs_to(models) or (engine.settings_key, engine.compiled) != (
                 settings,
                 compiled,
             ):

@@ -16,7 +16,6 @@ from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import sample_transitions
 from sb3_flowpolicy.engine.update import (
     Batch,
-    Losses,
     Moments,
     TrainState,
     UpdateSettings,
@@ -61,6 +60,16 @@ def why_unsupported(model: SAC) -> str | None:
         if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
             return "optimizer with hooks"
     return None
+
+
+def settings_key(model: SAC, critic_loss_coef: float) -> tuple[object, ...]:
+    """Everything that :func:`update_settings` depends on, quickly: asked before every update."""
+    groups = [model.actor.optimizer.param_groups[0], model.critic.optimizer.param_groups[0]]
+    if model.ent_coef_optimizer is not None:
+        groups.append(model.ent_coef_optimizer.param_groups[0])
+    names = ("betas", "eps", "weight_decay", "amsgrad", "maximize")
+    adam = [group.get(name) for group in groups for name in names]
+    return (model.tau, critic_loss_coef, model.target_entropy, *adam)
 
 
 def update_settings(model: SAC, critic_loss_coef: float) -> UpdateSettings:
@@ -115,9 +124,10 @@ class Engine:
             )
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
-        self.settings = update_settings(first, critic_loss_coef)
+        settings = update_settings(first, critic_loss_coef)
+        self.settings_key = settings_key(first, critic_loss_coef)
         self._identities = [_identity(model) for model in self.models]
-        self._update = make_update(self.networks, self.settings)
+        self._update = make_update(self.networks, settings)
         device = self.networks.actor.data.device
         self._compiled_update = Compiled(self._update, "the SAC update", device)
         networks = self.networks
@@ -212,17 +222,19 @@ class Engine:
                 model.gamma,
                 model.get_vec_normalize_env(),
             )
-            columns.append([part.unflatten(0, (n_updates, batch_size)) for part in sampled])
+            lead = (n_updates, 1, batch_size)
+            columns.append([part.view(*lead, *part.shape[1:]) for part in sampled])
         if len(columns) == 1:
-            stacked = [part.unsqueeze(1) for part in columns[0]]
+            stacked = columns[0]
         else:
-            stacked = [th.stack(parts, dim=1) for parts in zip(*columns, strict=True)]
+            stacked = [th.cat(parts, dim=1) for parts in zip(*columns, strict=True)]
         shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
         data = self.networks.actor.data
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
-        return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
+        parts = (part.unbind(0) for part in (*stacked, noise))
+        return [Batch(*columns) for columns in zip(*parts, strict=True)]
 
-    def train(self, batches: Sequence[Batch], start: int = 0) -> Losses:
+    def train(self, batches: Sequence[Batch], start: int = 0) -> th.Tensor:
         """Perform one update of all models per batch.
 
         Args:
@@ -230,7 +242,7 @@ class Engine:
             start: Number of updates done already since the target networks' turn was counted.
 
         Returns:
-            Means over the updates, per model.
+            Losses, means over the updates, (4, S); see ``LOSSES``.
         """
         first = self.models[0]
         optimizers = [first.actor.optimizer, first.critic.optimizer]
@@ -249,9 +261,7 @@ class Engine:
             else:
                 losses = self._update(state, batch, learning_rates, move_target)
             history.append(losses)
-        if len(history) == 1:
-            return history[0]
-        return Losses(*(th.stack(parts).mean(0) for parts in zip(*history, strict=True)))
+        return history[0] if len(history) == 1 else th.stack(history).mean(0)
 
 
 def _identity(model: SAC) -> tuple[object, ...]:

@@ -44,18 +44,8 @@ class Batch(NamedTuple):
     noise: th.Tensor  # (2, S, B, M): for the current and for the next observations
 
 
-class Losses(NamedTuple):
-    """What SB3 logs, per seed: each (S,)."""
-
-    ent_coef: th.Tensor
-    ent_coef_loss: th.Tensor
-    critic_loss: th.Tensor
-    actor_loss: th.Tensor
-
-    def of_seed(self, seed: int) -> dict[str, float]:
-        """Return one seed's losses as numbers, in one transfer from the device."""
-        values = th.stack([loss[seed] for loss in self]).tolist()
-        return dict(zip(self._fields, values, strict=True))
+LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
+"""What SB3 logs of an update: the rows of the tensor (4, S) that an update returns."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +60,8 @@ class UpdateSettings:
     ent_coef_adam: AdamSettings | None  # None: the temperature is fixed
 
 
-# (state, batch, learning rates, whether to move the target networks) -> losses
-Update = Callable[[TrainState, Batch, th.Tensor, bool], Losses]
+# (state, batch, learning rates, whether to move the target networks) -> losses, (4, S)
+Update = Callable[[TrainState, Batch, th.Tensor, bool], th.Tensor]
 
 
 def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
@@ -90,7 +80,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
 
     Returns:
         Function of (state, batch, learning rates of actor, critics and temperature, whether to
-        move the target networks).
+        move the target networks), which returns the losses (4, S), see ``LOSSES``.
 
     References:
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.
@@ -98,7 +88,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
 
     def update(
         state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
-    ) -> Losses:
+    ) -> th.Tensor:
         actor = state.actor.detach().requires_grad_()
         actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
 
@@ -154,11 +144,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         ):
             for old, new in zip(olds, news, strict=True):
                 old.copy_(new)
-        return Losses(
-            ent_coef.squeeze(-1),
-            ent_coef_loss.squeeze(-1),
-            critic_loss.detach(),
-            actor_loss.detach(),
-        )
+        temperature = ent_coef.squeeze(-1), ent_coef_loss.squeeze(-1)
+        return th.stack([*temperature, critic_loss.detach(), actor_loss.detach()])
 
     return update
