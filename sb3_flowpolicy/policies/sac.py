@@ -39,7 +39,8 @@ class DistributionPolicy(SACPolicy):
     Raises:
         ValueError: If the action space is no bounded Box, the density or one of its arguments
             is unknown, or ``use_sde=True`` is asked of anything but the diagonal normal
-            distribution (whose actor is then SB3's own).
+            distribution (whose actor is then SB3's own). Plain ``SAC`` refuses such an action
+            space itself, with an ``AssertionError``, before it builds the policy.
     """
 
     default_distribution: ClassVar[str]
