@@ -18,6 +18,7 @@ from sb3_flowpolicy.engine import Engine, settings_key
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
+from sb3_flowpolicy.seed_checkpoint import read_batch, write_batch
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
 from sb3_flowpolicy.seed_setup import (
     CallbackFactory,
@@ -183,14 +184,8 @@ class SeedBatch:
             folder: Where to; one ``seed_<seed>.zip`` and ``.buffer.pkl`` per agent, which can also
                 be loaded on their own, and ``batch.pt``.
         """
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        for seed, model in zip(self.seeds, self._models, strict=True):
-            model.save(Path(folder, f"seed_{seed}.zip"))
-            model.save_replay_buffer(Path(folder, f"seed_{seed}.buffer.pkl"))
         noise = {name: one.state() for name, one in self._noise.items()}
-        partial = Path(folder, "batch.pt.partial")
-        th.save({"seeds": self.seeds, "noise": noise}, partial)
-        partial.replace(Path(folder, "batch.pt"))
+        write_batch(folder, self.seeds, self._models, noise)
         self._obs = None
 
     @classmethod
@@ -215,18 +210,10 @@ class SeedBatch:
         Raises:
             ValueError: If the folder holds no complete batch.
         """
-        if not Path(folder, "batch.pt").is_file():
-            raise ValueError(f"folder must hold a saved batch, got {folder}")
-        saved = th.load(Path(folder, "batch.pt"), weights_only=True)
+        seeds, models, noise = read_batch(folder, env, algorithm)
         batch = cls.__new__(cls)
-        models = []
-        for seed in saved["seeds"]:
-            path = Path(folder, f"seed_{seed}.zip")
-            model = algorithm.load(path, env=make_env(env), device="cpu")
-            model.load_replay_buffer(Path(folder, f"seed_{seed}.buffer.pkl"))
-            models.append(model)
-        batch._adopt(models, saved["seeds"], env, monitor_dir)
-        for name, state in saved["noise"].items():
+        batch._adopt(models, seeds, env, monitor_dir)
+        for name, state in noise.items():
             batch._noise[name].set_state(state)
         return batch
 

@@ -19,6 +19,7 @@ FLOORS = [
     "sac_flow",
     "seed_episodes",
     "seed_setup",
+    "seed_checkpoint",
     "seed_batch",
     "hyperparameters",
     "train_seeds",

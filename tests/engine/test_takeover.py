@@ -1,0 +1,176 @@
+"""The engine holds models by the hand, not in a cage: what is done to them is noticed."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+
+from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy.engine import Engine
+from tests.engine.test_equality import (
+    BATCH_SIZE,
+    N_UPDATES,
+    Box,
+    assert_close,
+    assert_same,
+    everything,
+    make,
+    seed_everything,
+)
+
+
+def test_loading_a_checkpoint_between_updates_is_noticed(tmp_path: Path) -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    model.train(3, batch_size=BATCH_SIZE)
+    before = everything(model)
+    model.save(tmp_path / "model")
+    model.train(3, batch_size=BATCH_SIZE)
+    assert not th.equal(everything(model)["log_ent_coef"], before["log_ent_coef"])
+    model.set_parameters(str(tmp_path / "model.zip"))
+    assert model.log_ent_coef is not None
+    model.log_ent_coef.data = before["log_ent_coef"].clone()  # not among SB3's parameters
+    seed_everything()
+    model.train(3, batch_size=BATCH_SIZE)
+    went_on = everything(model)
+    fresh = SACFlow.load(tmp_path / "model", env=Box(), device="cpu")
+    fresh.replay_buffer = model.replay_buffer
+    fresh.set_logger(configure(None, []))
+    seed_everything()
+    fresh.train(3, batch_size=BATCH_SIZE)
+    assert_close(everything(fresh), went_on, th.float32)
+
+
+def test_several_environments_draw_as_sb3_does() -> None:
+    """Rows, then environments, minibatch by minibatch."""
+
+    def train(algorithm: type[SAC], policy: Any, **settings: Any) -> SAC:
+        env = make_vec_env(Box, n_envs=2)
+        model = algorithm(policy, env, seed=0, buffer_size=200, device="cpu", **settings)
+        model.set_logger(configure(None, []))
+        rng = np.random.default_rng(0)
+        assert model.replay_buffer is not None
+        for _ in range(100):
+            obs, next_obs = rng.uniform(-1, 1, (2, 2, 3)).astype(np.float32)
+            action, reward = rng.uniform(-1, 1, (2, 2)), rng.normal(size=2)
+            model.replay_buffer.add(obs, next_obs, action, reward, np.zeros(2), [{}, {}])
+        seed_everything()
+        model.train(N_UPDATES, batch_size=BATCH_SIZE)
+        return model
+
+    kwargs = {"policy_kwargs": {"net_arch": [16, 16]}}
+    stock = train(SAC, SACFlow.policy_aliases["FlowPolicy"], **kwargs)
+    ours = train(SACFlow, "FlowPolicy", compile=False, **kwargs)
+    assert_same(ours, stock, th.float32)
+
+
+def test_copies_and_steps_by_hand_see_the_true_step_count() -> None:
+    """The engine's state is torch.optim's state, at any moment."""
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    model.train(5, batch_size=BATCH_SIZE)
+    copied = copy.deepcopy(model.policy)
+    steps = [float(state["step"]) for state in copied.actor.optimizer.state.values()]
+    assert set(steps) == {5.0}
+    for parameter in model.actor.parameters():
+        parameter.grad = th.zeros_like(parameter)
+    model.actor.optimizer.step()
+    model.train(1, batch_size=BATCH_SIZE)
+    steps = [float(state["step"]) for state in model.actor.optimizer.state.values()]
+    assert set(steps) == {7.0}
+
+
+@pytest.mark.parametrize("what", ["policy", "optimizer", "temperature", "assign"])
+def test_replaced_objects_are_noticed(what: str) -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    model.train(2, batch_size=BATCH_SIZE)
+    if what == "policy":
+        model.policy = copy.deepcopy(model.policy)
+        model._create_aliases()
+    elif what == "optimizer":
+        model.actor.optimizer = th.optim.Adam(model.actor.parameters(), lr=1e-3)
+    elif what == "assign":
+        state = {key: value.clone() for key, value in model.policy.state_dict().items()}
+        model.policy.load_state_dict(state, assign=True)
+        # What was assigned has no optimiser yet.
+        for network in (model.actor, model.critic):
+            network.optimizer = th.optim.Adam(network.parameters(), lr=1e-3)
+    else:
+        model.log_ent_coef = th.log(th.full((1,), 0.01)).requires_grad_(True)
+        model.ent_coef_optimizer = th.optim.Adam([model.log_ent_coef], lr=3e-4)
+    before = model.policy.parameters_to_vector()
+    model.train(1, batch_size=BATCH_SIZE)
+    assert not np.array_equal(model.policy.parameters_to_vector(), before)
+    assert len(model.actor.optimizer.state) == len(list(model.actor.parameters()))
+    if what == "temperature":
+        assert model.logger.name_to_value["train/ent_coef"] == pytest.approx(0.01, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("policy_kwargs", "reason"),
+    [
+        ({"activation_fn": th.nn.PReLU}, "critic layer of type PReLU"),
+        ({"activation_fn": th.nn.RReLU}, "layer of type RReLU"),
+        ({"optimizer_class": th.optim.RMSprop}, "optimizer of type RMSprop"),
+        ({"optimizer_kwargs": {"amsgrad": True}}, "optimizer of type Adam"),
+    ],
+)
+def test_what_the_engine_cannot_do_is_left_to_sb3(policy_kwargs: dict, reason: str) -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, policy_kwargs=policy_kwargs)
+    with pytest.warns(UserWarning, match=f"the engine does not do {reason}"):
+        model.train(1, batch_size=BATCH_SIZE)
+
+
+def test_frozen_parameters_and_hooks_are_left_to_sb3() -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32)
+    for parameter in model.actor.latent_pi.parameters():
+        parameter.requires_grad_(False)
+    before = [parameter.clone() for parameter in model.actor.latent_pi.parameters()]
+    with pytest.warns(UserWarning, match="parameters that are frozen or have hooks"):
+        model.train(2, batch_size=BATCH_SIZE)
+    assert all(map(th.equal, model.actor.latent_pi.parameters(), before))
+    hooked = make(SACFlow, "FlowPolicy", th.float32)
+    calls = []
+    hooked.actor.optimizer.register_step_pre_hook(lambda *_: calls.append(1))
+    with pytest.warns(UserWarning, match="optimizer with hooks"):
+        hooked.train(2, batch_size=BATCH_SIZE)
+    assert len(calls) == 2
+
+
+def test_nan_stops_the_run() -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    assert model.replay_buffer is not None
+    model.replay_buffer.rewards[:] = np.nan
+    with pytest.raises(ValueError, match="loss must be finite, got nan"):
+        model.train(2, batch_size=BATCH_SIZE)
+    healthy = make(SACFlow, "FlowPolicy", th.float32)
+    with pytest.raises(ValueError, match="got actions with NaN"):
+        healthy.predict(np.full(3, np.nan, dtype=np.float32))
+
+
+def test_settings_changed_between_updates_are_noticed() -> None:
+    model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
+    model.train(1, batch_size=BATCH_SIZE)
+    model.tau = 1.0
+    model.train(1, batch_size=BATCH_SIZE)
+    critic, target = model.critic.state_dict(), model.critic_target.state_dict()
+    assert all(th.equal(target[key], value) for key, value in critic.items())
+
+
+def test_released_models_own_their_memory() -> None:
+    models = [make(SACFlow, "FlowPolicy", th.float32, seed=seed) for seed in range(2)]
+    engine = Engine(models)
+    engine.train(engine.draw(2, BATCH_SIZE))
+    before = everything(models[0])
+    engine.release()
+    assert_close(everything(models[0]), before, th.float32)
+    with th.no_grad():
+        engine.networks.actor.data.zero_()
+        engine.actor_adam.mean.zero_()
+    assert_close(everything(models[0]), before, th.float32)
