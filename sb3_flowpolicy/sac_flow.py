@@ -156,9 +156,8 @@ class SACFlow(SAC):
         planned = self._planned_updates(total_timesteps)
         self._worth_compiling = planned >= UPDATES_WORTH_COMPILING
         self._engine_refused = False
-        if self._engine is not None and why_unsupported(self) is not None:
-            self._engine.release()
-            self._engine = None
+        if why_unsupported(self) is not None:
+            self._drop_engine()
         if self._engine is not None:
             self._engine.synchronize()
         return total_timesteps, callback
@@ -230,8 +229,7 @@ class SACFlow(SAC):
             and engine.belongs_to([self])
         ):
             return engine
-        if engine is not None:
-            engine.release()
+        self._drop_engine()
         reason = why_unsupported(self)
         if reason is not None:
             self._engine_refused = True
@@ -243,6 +241,12 @@ class SACFlow(SAC):
             return None
         self._engine = Engine([self], self.critic_loss_coef, compiled)
         return self._engine
+
+    def _drop_engine(self) -> None:
+        """Let go of an engine that does not fit: acting with it would be acting on old weights."""
+        if self._engine is not None:
+            self._engine.release()
+            self._engine = None
 
     def _train_with_sb3(self, gradient_steps: int, batch_size: int) -> None:
         """Run SB3's loop, with the critic's gradient scaled to ``critic_loss_coef``."""
