@@ -323,11 +323,9 @@ class SeedBatch:
         if rate != first.actor.optimizer.param_groups[0]["lr"]:
             for model in self._models:
                 update_learning_rate(model.actor.optimizer, rate)
-        draws = range(first.gradient_steps)
-        rows = th.stack([self._noise["rows"].draw() for _ in draws])
-        noise = th.stack([self._noise["updates"].draw().movedim(1, 0) for _ in draws])
-        index = (rows * len(self._storage)).long()
-        self._losses = self._engine.train(self._storage.gather(index, first.gamma, noise))
+        rows = self._noise["rows"].draw_many(first.gradient_steps)
+        noise = self._noise["updates"].draw_many(first.gradient_steps).transpose(1, 2)
+        self._losses = self._engine.train(self._storage.gather(rows, first.gamma, noise))
         for model in self._models:
             model._n_updates += first.gradient_steps
 

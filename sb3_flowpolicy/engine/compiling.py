@@ -33,6 +33,9 @@ class Compiled:
         # Dynamo would check at each call that modules and shapes are those it compiled for, which
         # takes as long as the update of a small network. Here the caller knows: see __call__.
         self._options: dict[str, Any] = {"guard_filter_fn": th.compiler.skip_all_guards_unsafe}
+        # Inductor would leave loops over two or three action dimensions scalar: exp, tanh and
+        # log1p then cost as much as all products of a small network together.
+        self._options["cpp.enable_tiling_heuristics"] = False
         # Launching kernels from Python would cost more than running them.
         faster = "triton.cudagraphs" if device.type == "cuda" else "cpp_wrapper"
         self._options[faster] = True

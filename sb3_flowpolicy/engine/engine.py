@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
@@ -13,7 +14,7 @@ from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.networks import StackedNetworks
-from sb3_flowpolicy.engine.replay import sample_transitions
+from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
 from sb3_flowpolicy.engine.update import (
     Batch,
     Moments,
@@ -135,6 +136,7 @@ class Engine:
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
             return networks.sample(actor, obs, noise)[0]
 
+        self._rows: ReplayRows | None = None
         self._sample = sample
         self._compiled_sample = Compiled(sample, "the policy", device)
 
@@ -212,27 +214,31 @@ class Engine:
 
     def draw(self, n_updates: int, batch_size: int) -> list[Batch]:
         """Draw minibatches and noise for ``n_updates`` updates at once."""
-        columns = []
-        for model in self.models:
-            assert model.replay_buffer is not None
-            sampled = sample_transitions(
-                model.replay_buffer,
-                n_updates,
-                batch_size,
-                model.gamma,
-                model.get_vec_normalize_env(),
-            )
-            lead = (n_updates, 1, batch_size)
-            columns.append([part.view(*lead, *part.shape[1:]) for part in sampled])
-        if len(columns) == 1:
-            stacked = columns[0]
-        else:
-            stacked = [th.cat(parts, dim=1) for parts in zip(*columns, strict=True)]
         shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
         data = self.networks.actor.data
+        buffers = [model.replay_buffer for model in self.models if model.replay_buffer is not None]
+        first, gamma = self.models[0], self.models[0].gamma
+        if len(buffers) == 1 and self._reads_rows(first, buffers[0]):
+            if self._rows is None or not self._rows.holds(buffers):
+                self._rows = ReplayRows(buffers)
+            index = draw_index(buffers[0], n_updates, batch_size)
+            noise = th.randn(shape, dtype=data.dtype, device=data.device)
+            return self._rows.take(index, gamma, noise)
+        columns = [
+            sample_columns(
+                buffer, n_updates, batch_size, model.gamma, model.get_vec_normalize_env()
+            )
+            for model, buffer in zip(self.models, buffers, strict=True)
+        ]
+        stacked = [th.cat(parts, dim=1) for parts in zip(*columns, strict=True)]
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
-        parts = (part.unbind(0) for part in (*stacked, noise))
-        return [Batch(*columns) for columns in zip(*parts, strict=True)]
+        return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
+
+    @staticmethod
+    def _reads_rows(model: SAC, buffer: ReplayBuffer) -> bool:
+        """Whole numbers, pixels say, would take four times the memory as rows of floats."""
+        real = buffer.observations.dtype.kind == "f"
+        return is_plain(buffer) and real and model.get_vec_normalize_env() is None
 
     def train(self, batches: Sequence[Batch], start: int = 0) -> th.Tensor:
         """Perform one update of all models per batch.
@@ -256,7 +262,7 @@ class Engine:
         for k, batch in enumerate(batches, start):
             move_target = k % first.target_update_interval == 0
             if self._runs_compiled():
-                key = (batch.noise.shape, move_target)
+                key = (batch.noise.shape, batch.obs.stride(), move_target)
                 losses = self._compiled_update(key, state, batch, learning_rates, move_target)
             else:
                 losses = self._update(state, batch, learning_rates, move_target)

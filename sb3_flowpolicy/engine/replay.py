@@ -1,6 +1,9 @@
-"""Minibatches for many updates at once, gathered straight from SB3's replay buffer."""
+"""Replay buffers as rows: one transition, one row; one gather per ``train()`` call."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch as th
@@ -8,51 +11,94 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_flowpolicy.engine.update import Batch
 
-def sample_transitions(
-    buffer: ReplayBuffer,
-    n_updates: int,
-    batch_size: int,
-    gamma: float,
-    env: VecNormalize | None = None,
-) -> tuple[th.Tensor, ...]:
-    """Draw minibatches, with the random numbers that SB3's own sampling would take.
+# A column is an attribute of SB3's buffer; a row holds one transition, in this order.
+COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
-    A plain buffer on the CPU is read through tensors that share its memory, one gather per
-    column for all updates of a ``train()`` call. Any other buffer (n-step, HER, memory-saving)
-    is asked itself, once.
+
+def is_plain(buffer: ReplayBuffer) -> bool:
+    """Whether a buffer is SB3's own, which can be read as rows: n-step, HER and others sample."""
+    return type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage
+
+
+class ReplayRows:
+    """Replay buffers of S agents as one array, (capacity, environments of all agents, width).
+
+    The buffers' own arrays become views of it: whoever writes to them, or saves them, goes on.
 
     Args:
-        buffer: SB3's replay buffer, not empty.
-        n_updates: Number of minibatches.
-        batch_size: Transitions per minibatch.
-        gamma: Discount factor, where the buffer does not bring its own.
-        env: ``VecNormalize`` that normalises observations and rewards.
+        buffers: Plain SB3 buffers (see :func:`is_plain`) of the same spaces, sizes and contents.
+    """
+
+    def __init__(self, buffers: Sequence[ReplayBuffer]) -> None:
+        self.buffers = list(buffers)
+        first = buffers[0]
+        self.n_envs = first.n_envs
+        self.obs_shape = first.observations.shape[2:]
+        samples = [getattr(first, name) for name in COLUMNS]
+        self.widths = [int(np.prod(sample.shape[2:])) for sample in samples]
+        dtype = np.result_type(*samples)
+        shape = (first.buffer_size, self.n_envs * len(buffers), sum(self.widths))
+        # Pages that nobody wrote to take no memory yet.
+        rows = np.zeros(shape, dtype)
+        self.columns = dict(zip(COLUMNS, self._views(rows, samples), strict=True))
+        self._owned = []
+        for index, buffer in enumerate(self.buffers):
+            own = slice(index * self.n_envs, (index + 1) * self.n_envs)
+            filled = buffer.size()
+            for name, column in self.columns.items():
+                column[:filled, own] = getattr(buffer, name)[:filled]
+                view = column[:, own]
+                setattr(buffer, name, view)
+                self._owned.append((buffer, name, view))
+        self._flat = th.from_numpy(rows).flatten(0, 1)
+
+    def _views(self, rows: np.ndarray, samples: Sequence[np.ndarray]) -> list[np.ndarray]:
+        parts = np.split(rows, np.cumsum(self.widths)[:-1], axis=-1)
+        return [
+            part.reshape(*part.shape[:2], *sample.shape[2:])
+            for part, sample in zip(parts, samples, strict=True)
+        ]
+
+    def holds(self, buffers: Sequence[ReplayBuffer]) -> bool:
+        """Whether these still are the buffers, and their arrays still views."""
+        same = all(ours is theirs for ours, theirs in zip(self.buffers, buffers, strict=True))
+        return same and all(getattr(buffer, name) is view for buffer, name, view in self._owned)
+
+    def take(self, index: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
+        """Gather minibatches.
+
+        Args:
+            index: Transitions, (n, S, B), counted over all environments of all agents.
+            gamma: Discount factor.
+            noise: Standard normals, (n, 2, S, B, M), of the data type and on the device to
+                train with.
+
+        Returns:
+            n batches.
+        """
+        rows = self._flat.index_select(0, index.flatten()).to(noise.device, noise.dtype)
+        parts = rows.view(*index.shape, -1).split(self.widths, dim=-1)
+        obs, next_obs, actions, rewards, dones, timeouts = parts
+        if len(self.obs_shape) != 1:
+            obs, next_obs = (part.unflatten(-1, self.obs_shape) for part in (obs, next_obs))
+        # A time limit is no end of the world: its value is bootstrapped.
+        ends = (dones * (1 - timeouts)).squeeze(-1)
+        discounts = _constant(gamma, tuple(index.shape[1:]), noise.dtype, noise.device)
+        rewards = rewards.squeeze(-1)
+        return [
+            Batch(obs[k], actions[k], next_obs[k], ends[k], rewards[k], discounts, noise[k])
+            for k in range(len(index))
+        ]
+
+
+def draw_index(buffer: ReplayBuffer, n_updates: int, batch_size: int) -> th.Tensor:
+    """Draw transitions with the random numbers that SB3's own sampling would take.
 
     Returns:
-        Observations, actions, next observations, dones, rewards and discounts on the buffer's
-        device, with n_updates x batch_size rows; the last three one-dimensional.
+        Indices, (n_updates, 1, batch_size), counted over the buffer's environments.
     """
-    plain = type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage and env is None
-    if plain and buffer.device.type == "cpu":
-        return _gather(buffer, n_updates, batch_size, gamma)
-    samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
-    discounts = samples.discounts
-    if discounts is None:
-        discounts = th.full_like(samples.rewards, gamma)
-    return (
-        samples.observations,
-        samples.actions,
-        samples.next_observations,
-        samples.dones.squeeze(-1),
-        samples.rewards.squeeze(-1),
-        discounts.squeeze(-1),
-    )
-
-
-def _gather(
-    buffer: ReplayBuffer, n_updates: int, batch_size: int, gamma: float
-) -> tuple[th.Tensor, ...]:
     # SB3's buffers draw from numpy's global generator: rows, then environments, per minibatch.
     draw = np.random.randint
     if buffer.n_envs == 1:
@@ -64,18 +110,46 @@ def _gather(
             for _ in range(n_updates)
         ]
         rows = np.concatenate(parts)
-    index = th.from_numpy(rows)
+    return th.from_numpy(rows).view(n_updates, 1, batch_size)
 
-    def take(array: np.ndarray) -> th.Tensor:
-        return th.from_numpy(array).flatten(0, 1).index_select(0, index)
 
-    # A time limit is no end of the world: its value is bootstrapped.
-    dones = take(buffer.dones) * (1 - take(buffer.timeouts))
-    return (
-        take(buffer.observations),
-        take(buffer.actions),
-        take(buffer.next_observations),
-        dones,
-        take(buffer.rewards),
-        th.full_like(dones, gamma),
+def sample_columns(
+    buffer: ReplayBuffer,
+    n_updates: int,
+    batch_size: int,
+    gamma: float,
+    env: VecNormalize | None = None,
+) -> list[th.Tensor]:
+    """Ask a buffer for minibatches itself, once for all updates: n-step, HER, VecNormalize, ...
+
+    Args:
+        buffer: SB3's replay buffer, not empty.
+        n_updates: Number of minibatches.
+        batch_size: Transitions per minibatch.
+        gamma: Discount factor, where the buffer does not bring its own.
+        env: ``VecNormalize`` that normalises observations and rewards.
+
+    Returns:
+        The fields of :class:`Batch` but for the noise, each (n_updates, 1, batch_size, ...).
+    """
+    samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
+    discounts = samples.discounts
+    if discounts is None:
+        discounts = th.full_like(samples.rewards, gamma)
+    columns = (
+        samples.observations,
+        samples.actions,
+        samples.next_observations,
+        samples.dones.squeeze(-1),
+        samples.rewards.squeeze(-1),
+        discounts.squeeze(-1),
     )
+    return [column.unflatten(0, (n_updates, 1, batch_size)) for column in columns]
+
+
+@lru_cache(maxsize=8)
+def _constant(
+    value: float, shape: tuple[int, ...], dtype: th.dtype, device: th.device
+) -> th.Tensor:
+    # Rewards and discounts are float32 in SB3's buffers, whatever the networks are.
+    return th.full(shape, value, device=device).to(dtype)

@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_flowpolicy.engine.replay import ReplayRows, is_plain
 from sb3_flowpolicy.engine.update import Batch
 
 # Random numbers are drawn for this many updates or steps at once: a call per seed costs as much
@@ -18,21 +19,18 @@ AHEAD = 64
 class SeedStorage:
     """Replay buffers of S models as one: written once per step, read with one gather.
 
-    The models' own buffers become views, so that each of them can be saved like any other. All
-    must be plain SB3 buffers of one environment, on the CPU.
+    The models' own buffers become views, so that each of them can be saved like any other.
 
     Args:
-        buffers: One empty or equally filled buffer per seed.
+        buffers: One buffer per seed, equally filled: plain SB3 buffers of one environment.
 
     Raises:
         ValueError: If a buffer is of another kind, or they are filled differently.
     """
 
-    COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-
     def __init__(self, buffers: Sequence[ReplayBuffer]) -> None:
         for buffer in buffers:
-            if type(buffer) is not ReplayBuffer or buffer.optimize_memory_usage:
+            if not is_plain(buffer):
                 raise ValueError(
                     f"replay buffers must be plain ReplayBuffers, got {type(buffer).__name__} with "
                     f"optimize_memory_usage={buffer.optimize_memory_usage}"
@@ -41,17 +39,8 @@ class SeedStorage:
         self.capacity = buffers[0].buffer_size
         self.pos, self.full = 0, False
         self.synchronize()
-        self.columns: dict[str, np.ndarray] = {}
-        for name in self.COLUMNS:
-            parts = [getattr(buffer, name) for buffer in buffers]
-            # One seed's copy at a time: two buffers of all seeds would not be needed at once.
-            column = np.zeros((parts[0].shape[0], len(parts), *parts[0].shape[2:]), parts[0].dtype)
-            for seed, buffer in enumerate(buffers):
-                if buffer.size():
-                    column[:, seed] = getattr(buffer, name)[:, 0]
-                setattr(buffer, name, column[:, seed : seed + 1])
-            self.columns[name] = column
-        self._flat = {name: th.from_numpy(col).flatten(0, 1) for name, col in self.columns.items()}
+        self.rows = ReplayRows(buffers)
+        self._seeds = th.arange(len(buffers)).unsqueeze(-1)
 
     def __len__(self) -> int:
         """Number of transitions per seed."""
@@ -60,7 +49,7 @@ class SeedStorage:
     def add(self, **values: np.ndarray) -> None:
         """Append one transition per seed; each value has a leading axis S."""
         for name, value in values.items():
-            self.columns[name][self.pos] = value
+            self.rows.columns[name][self.pos] = value
         self.pos = (self.pos + 1) % self.capacity
         self.full = self.full or self.pos == 0
 
@@ -80,36 +69,19 @@ class SeedStorage:
         for buffer in self.buffers:
             buffer.pos, buffer.full = self.pos, self.full
 
-    def gather(self, rows: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
+    def gather(self, uniform: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
         """Return minibatches.
 
         Args:
-            rows: Indices of transitions, (n, S, B), below the storage's length.
+            uniform: Which transitions, as numbers in [0, 1), (n, S, B).
             gamma: Discount factor.
             noise: Standard normals, (n, 2, S, B, M).
 
         Returns:
             n batches.
         """
-        n_seeds = len(self.buffers)
-        index = (rows * n_seeds + th.arange(n_seeds).unsqueeze(-1)).flatten()
-        taken = {
-            name: column.index_select(0, index).unflatten(0, rows.shape)
-            for name, column in self._flat.items()
-        }
-        # A time limit is no end of the world: its value is bootstrapped.
-        dones = taken["dones"] * (1 - taken["timeouts"])
-        discounts = th.full_like(dones, gamma)
-        columns = (
-            taken["observations"],
-            taken["actions"],
-            taken["next_observations"],
-            dones,
-            taken["rewards"],
-            discounts,
-            noise,
-        )
-        return [Batch(*(column[k] for column in columns)) for k in range(len(rows))]
+        index = (uniform * len(self)).long().mul_(len(self.buffers)).add_(self._seeds)
+        return self.rows.take(index, gamma, noise)
 
 
 class SeedNoise:
@@ -149,6 +121,13 @@ class SeedNoise:
             self._next = 0
         self._next += 1
         return self._pool[self._next - 1]
+
+    def draw_many(self, count: int) -> th.Tensor:
+        """Return the next ``count`` numbers of every seed, (count, S, *shape)."""
+        first = self.draw().unsqueeze(0)
+        return (
+            first if count == 1 else th.cat([first, *(self.draw()[None] for _ in range(1, count))])
+        )
 
     def state(self) -> dict[str, object]:
         """Return what is needed to go on with the same numbers."""
