@@ -76,7 +76,9 @@ class SeedEpisodes:
             if self.writers:
                 self.writers[seed].write_row(episode)
             model._episode_num += 1
-            if log_interval is not None and model._episode_num % log_interval == 0:
+            due = log_interval is not None and model._episode_num % log_interval == 0
+            # Where the logger has nowhere to write to, there is nothing to put together.
+            if due and model.logger.output_formats:
                 self.before_dump(seed)
                 model.dump_logs()
         self.returns[dones] = 0

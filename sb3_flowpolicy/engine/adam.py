@@ -47,7 +47,6 @@ class FlatAdam:
         self.settings = settings
         self.flat = flat
         self.optimizers = optimizers
-        self._addresses: list[tuple[th.optim.Optimizer, th.Tensor, int]] = []
         self.bind()
 
     def bind(self) -> None:
@@ -57,7 +56,7 @@ class FlatAdam:
         # One count per parameter, as in torch.optim, though they never differ.
         n_owners = len(self.flat.views(data, 0))
         self.step = th.zeros(len(data), n_owners, device=data.device)
-        self._addresses = []
+        self._bound: list[tuple[th.optim.Optimizer, th.Tensor, int, int]] = []
         for seed, optimizer in enumerate(self.optimizers):
             pairs = self.flat.views(self.mean, seed), self.flat.views(self.square, seed)
             for step, (owner, mean), (_, square) in zip(self.step[seed], *pairs, strict=True):
@@ -67,22 +66,30 @@ class FlatAdam:
                     mean.copy_(state["exp_avg"])
                     square.copy_(state["exp_avg_sq"])
                 state.update(step=step, exp_avg=mean, exp_avg_sq=square)
-                self._addresses.append((optimizer, owner, mean.data_ptr()))
+            owner, mean = pairs[0][-1]
+            self._bound.append((optimizer, owner, len(optimizer.state), mean.data_ptr()))
 
     def is_bound(self) -> bool:
-        """Whether the optimisers' states still are views: loading a checkpoint undoes it."""
-        return bool(self._addresses) and all(
-            owner in optimizer.state and optimizer.state[owner]["exp_avg"].data_ptr() == address
-            for optimizer, owner, address in self._addresses
-        )
+        """Whether the optimisers' states still are views: loading a checkpoint undoes it.
+
+        Asked before every update, it looks at one entry per optimiser: states are replaced, or
+        cleared, as a whole.
+        """
+        for optimizer, owner, count, address in self._bound:
+            state = optimizer.state
+            if len(state) != count or owner not in state:
+                return False
+            if state[owner]["exp_avg"].data_ptr() != address:
+                return False
+        return True
 
     def release(self) -> None:
         """Give the optimisers memory of their own again."""
-        for optimizer, owner, _ in self._addresses:
-            state = optimizer.state[owner]
-            for key in ("step", "exp_avg", "exp_avg_sq"):
-                if key in state:
-                    state[key] = state[key].clone()
+        for optimizer in self.optimizers:
+            for state in optimizer.state.values():
+                for key in ("step", "exp_avg", "exp_avg_sq"):
+                    if key in state:
+                        state[key] = state[key].clone()
 
 
 def adam_step(

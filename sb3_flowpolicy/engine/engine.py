@@ -128,6 +128,7 @@ class Engine:
         settings = update_settings(first, critic_loss_coef)
         self.settings_key = settings_key(first, critic_loss_coef)
         self._identities = [_identity(model) for model in self.models]
+        self._slots = [slot for model in self.models for slot in _slots(model)]
         self._update = make_update(self.networks, settings)
         device = self.networks.actor.data.device
         self._compiled_update = Compiled(self._update, "the SAC update", device)
@@ -137,6 +138,9 @@ class Engine:
             return networks.sample(actor, obs, noise)[0]
 
         self._rows: ReplayRows | None = None
+        self._state: TrainState | None = None
+        self._fixed: list[th.Tensor] = []
+        self._learning_rates: tuple[list[float], th.Tensor] | None = None
         self._sample = sample
         self._compiled_sample = Compiled(sample, "the policy", device)
 
@@ -147,11 +151,10 @@ class Engine:
 
     def belongs_to(self, models: Sequence[SAC]) -> bool:
         """Whether these still are the models, down to their networks and optimisers."""
-        return all(
-            now is then
-            for new, old in zip(models, self._identities, strict=True)
-            for now, then in zip(_identity(new), old, strict=True)
-        )
+        for model, kept in zip(models, self._identities, strict=True):
+            if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):
+                return False
+        return all(home[name] is parameter for home, name, parameter in self._slots)
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
@@ -167,6 +170,7 @@ class Engine:
         if not all(part.is_bound() for part in self._parts()):
             for part in self._parts():
                 part.bind()
+            self._state = None
 
     def release(self) -> None:
         """Give modules and optimisers memory of their own, until the next update."""
@@ -194,14 +198,22 @@ class Engine:
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""
+        # A fixed temperature may be set anew between two calls.
+        fixed = [] if self.temperature else [model.ent_coef_tensor for model in self.models]
+        kept = self._state is not None and len(fixed) == len(self._fixed)
+        if not kept or any(now is not then for now, then in zip(fixed, self._fixed, strict=True)):
+            self._state, self._fixed = self._gather_state(fixed), fixed
+        assert self._state is not None
+        return self._state
 
+    def _gather_state(self, fixed: list[th.Tensor]) -> TrainState:
         def moments(adam: FlatAdam) -> Moments:
             return Moments(adam.mean, adam.square, adam.step)
 
         if self.temperature is not None:
             temperature = self.temperature.data
         else:
-            temperature = th.stack([model.ent_coef_tensor.reshape(1) for model in self.models])
+            temperature = th.stack([tensor.reshape(1) for tensor in fixed])
         return TrainState(
             self.networks.actor.data,
             self.networks.critic.data,
@@ -255,8 +267,10 @@ class Engine:
         # A fixed temperature takes no steps, at whatever rate.
         optimizers.append(first.ent_coef_optimizer or first.actor.optimizer)
         rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
-        device = self.networks.actor.data.device
-        learning_rates = th.tensor(rates, dtype=th.float64, device=device)
+        if self._learning_rates is None or self._learning_rates[0] != rates:
+            device = self.networks.actor.data.device
+            self._learning_rates = rates, th.tensor(rates, dtype=th.float64, device=device)
+        learning_rates = self._learning_rates[1]
         state = self.state()
         history = []
         for k, batch in enumerate(batches, start):
@@ -278,8 +292,17 @@ def _identity(model: SAC) -> tuple[object, ...]:
         model.critic.optimizer,
         model.ent_coef_optimizer,
         model.log_ent_coef,
-        # Parameters are replaced all at once, by load_state_dict(assign=True) for example.
-        next(model.actor.parameters()),
-        next(model.critic.parameters()),
-        next(model.critic_target.parameters()),
     )
+
+
+def _slots(model: SAC) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter]]:
+    """Where the first parameter of each network lives, and which it is.
+
+    Parameters are replaced all at once, by ``load_state_dict(assign=True)`` for example.
+    """
+    slots = []
+    for network in (model.actor, model.critic, model.critic_target):
+        path, parameter = next(network.named_parameters())
+        module, _, name = path.rpartition(".")
+        slots.append((network.get_submodule(module)._parameters, name, parameter))
+    return slots
