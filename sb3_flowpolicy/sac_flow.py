@@ -54,6 +54,9 @@ class SACFlow(SAC):
         compile: Whether to compile the update: several times faster after 10 to 30 seconds of
             warm-up. ``"auto"`` does when a call of :meth:`learn` plans enough updates to repay
             it. Compiled or not, the numbers are the same.
+        autocast: Whether matrix products run in bfloat16 (``torch.autocast``), on processors that
+            have it 1.2 to 1.6 times as fast for networks of 128 units or more, and slower for small
+            ones. Parameters, optimiser states and replay stay float32; products keep 8 bits.
         **sac_kwargs: Keyword arguments of SB3's SAC.
 
     Raises:
@@ -94,6 +97,7 @@ class SACFlow(SAC):
         demonstrations: str | Path | Mapping[str, np.ndarray] | None = None,
         critic_loss_coef: float = SB3_CRITIC_LOSS_COEF,
         compile: bool | Literal["auto"] = "auto",
+        autocast: bool = False,
         **sac_kwargs: Any,
     ) -> None:
         if random_steps is not None and random_steps < 0:
@@ -105,6 +109,7 @@ class SACFlow(SAC):
         self.random_steps = random_steps
         self.critic_loss_coef = critic_loss_coef
         self.compile: bool | Literal["auto"] = compile
+        self.autocast = autocast
         self._worth_compiling = False
         self._engine: Engine | None = None
         self._engine_refused = False
@@ -225,6 +230,7 @@ class SACFlow(SAC):
         if (
             engine is not None
             and (engine.compiled or not compiled)
+            and engine.autocast == self.autocast
             and engine.settings_key == settings_key(self, self.critic_loss_coef)
             and engine.belongs_to([self])
         ):
@@ -239,7 +245,7 @@ class SACFlow(SAC):
                 stacklevel=3,
             )
             return None
-        self._engine = Engine([self], self.critic_loss_coef, compiled)
+        self._engine = Engine([self], self.critic_loss_coef, compiled, self.autocast)
         return self._engine
 
     def _drop_engine(self) -> None:

@@ -138,7 +138,9 @@ class SeedBatch:
         first = self._models[0]
         if self._obs is None or reset_num_timesteps:
             # Typed as one seed, documented as one per environment.
-            self._obs, _ = self._venv.reset(seed=list(self.seeds))  # type: ignore[arg-type]
+            # Who goes on after saving must not see the same episodes again.
+            seeds = [seed + first.num_timesteps for seed in self.seeds]
+            self._obs, _ = self._venv.reset(seed=seeds)  # type: ignore[arg-type]
             self._episodes.restart()
         to_go = first._total_timesteps - first.num_timesteps
         bar = make_progress_bar(to_go) if progress_bar else None
@@ -249,14 +251,12 @@ class SeedBatch:
         engine = self._engine
         if engine is not None:
             compiled = compiled or engine.compiled
-            if not engine.belongs_to(models) or (engine.settings_key, engine.compiled) != (
-                settings,
-                compiled,
-            ):
+            has = engine.settings_key, engine.compiled, engine.autocast
+            if not engine.belongs_to(models) or has != (settings, compiled, first.autocast):
                 engine.release()
                 self._engine = None
         if self._engine is None:
-            self._engine = Engine(models, first.critic_loss_coef, compiled)
+            self._engine = Engine(models, first.critic_loss_coef, compiled, first.autocast)
         self._engine.synchronize()
         buffers = self._buffers()
         if any(

@@ -117,6 +117,18 @@ def test_saved_batch_goes_on_as_if_nothing_had_happened(tmp_path: Path) -> None:
         np.testing.assert_allclose(vector(got), vector(expected), rtol=1e-4, atol=1e-5)
 
 
+def test_saving_often_does_not_repeat_the_same_episodes(tmp_path: Path) -> None:
+    batch = SeedBatch("FlowPolicy", "Pendulum-v1", 2, **{**FAST, "learning_starts": 50})
+    starts = []
+    for _ in range(2):
+        batch.learn(5, reset_num_timesteps=False)
+        buffer = batch.models[0].replay_buffer
+        assert buffer is not None
+        starts.append(buffer.observations[buffer.pos - 5, 0].copy())
+        batch.save(tmp_path)
+    assert not np.array_equal(*starts)
+
+
 def test_environments_without_a_vectorised_form() -> None:
     batch = SeedBatch("GaussPolicy", lambda: IdentityEnvBox(eps=0.5), 2, **FAST).learn(60)
     assert all(np.isfinite(vector(model)).all() for model in batch.models)

@@ -98,6 +98,7 @@ class Engine:
         critic_loss_coef: Factor of the critics' summed mean squared error; 0.5 in SB3.
         compiled: Whether to compile the update. Where no compiler works, it runs eagerly, with
             one warning and the same numbers.
+        autocast: Whether matrix products of updates run in bfloat16.
     """
 
     def __init__(
@@ -105,11 +106,13 @@ class Engine:
         models: Sequence[SAC],
         critic_loss_coef: float = 0.5,
         compiled: bool = False,
+        autocast: bool = False,
     ) -> None:
         self.models = list(models)
         self.compiled = compiled
+        self.autocast = autocast
         first = self.models[0]
-        self.networks = StackedNetworks([model.policy for model in self.models])
+        self.networks = StackedNetworks([model.policy for model in self.models], autocast)
         self.actor_adam = FlatAdam(
             self.networks.actor, [model.policy.actor.optimizer for model in self.models]
         )

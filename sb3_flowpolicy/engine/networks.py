@@ -30,12 +30,14 @@ class StackedNetworks:
 
     Args:
         policies: S policies with a :class:`FlowActor` and parameter-free features extractors.
+        autocast: Whether matrix products run in bfloat16; parameters and results stay as they are.
     """
 
-    def __init__(self, policies: Sequence[SACPolicy]) -> None:
+    def __init__(self, policies: Sequence[SACPolicy], autocast: bool = False) -> None:
         first = policies[0]
         assert isinstance(first.actor, FlowActor)
         self.n_seeds = len(policies)
+        self.autocast = autocast
         self.actor = FlatParameters([_actor_layout(policy) for policy in policies])
         self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies], True)
         self.target = FlatParameters(
@@ -59,12 +61,15 @@ class StackedNetworks:
             Actions (S, B, D) and log-probabilities (S, B).
         """
         parameters = self.actor.unflatten(actor)
-        if self.n_seeds > 1:
-            return vmap(self._sample_one)(parameters, obs, noise)
-        # One seed takes no detour: vmap over a single one would turn products into batched ones.
-        single = {name: value.squeeze(0) for name, value in parameters.items()}
-        actions, log_prob = self._sample_one(single, obs.squeeze(0), noise.squeeze(0))
-        return actions.unsqueeze(0), log_prob.unsqueeze(0)
+        with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
+            if self.n_seeds > 1:
+                actions, log_prob = vmap(self._sample_one)(parameters, obs, noise)
+            else:
+                # No detour for one seed: vmap would turn products into batched ones.
+                single = {name: value.squeeze(0) for name, value in parameters.items()}
+                actions, log_prob = self._sample_one(single, obs.squeeze(0), noise.squeeze(0))
+                actions, log_prob = actions.unsqueeze(0), log_prob.unsqueeze(0)
+        return actions.to(actor.dtype), log_prob.to(actor.dtype)
 
     def _sample_one(
         self, parameters: dict[str, th.Tensor], obs: th.Tensor, noise: th.Tensor
@@ -87,13 +92,14 @@ class StackedNetworks:
         features = features.unflatten(0, obs.shape[:2])
         hidden = th.cat([features, actions], dim=-1).unsqueeze(1)
         parameters = self.critic.unflatten(critic)
-        for name, layer in self._critic.q_networks[0].named_children():
-            if isinstance(layer, nn.Linear):
-                weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
-                hidden = hidden @ weight.mT + bias.unsqueeze(-2)
-            else:
-                hidden = layer(hidden)
-        return hidden.squeeze(-1)
+        with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
+            for name, layer in self._critic.q_networks[0].named_children():
+                if isinstance(layer, nn.Linear):
+                    weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
+                    hidden = hidden @ weight.mT + bias.unsqueeze(-2)
+                else:
+                    hidden = layer(hidden)
+        return hidden.squeeze(-1).to(critic.dtype)
 
 
 def _actor_layout(policy: SACPolicy) -> Layout:

@@ -187,3 +187,19 @@ def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th
             th.testing.assert_close(losses[:, [seed]], expected, rtol=1e-4, atol=1e-5)
     for got, single in zip(stacked.models, singles, strict=True):
         assert_close(everything(got), everything(single.models[0]), dtype)
+
+
+@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+def test_autocast_rounds_products_and_nothing_else(policy: str) -> None:
+    exact, rounded = (make(SACFlow, policy, th.float32, autocast=on) for on in (False, True))
+    rounded.policy.load_state_dict(exact.policy.state_dict())
+    for model in (exact, rounded):
+        seed_everything()
+        model.train(1, batch_size=BATCH_SIZE)
+    losses = [model.logger.name_to_value["train/critic_loss"] for model in (exact, rounded)]
+    assert losses[0] != losses[1]
+    assert losses[1] == pytest.approx(losses[0], rel=0.02)
+    # One step of Adam moves each parameter by at most about the learning rate.
+    for key, value in everything(exact).items():
+        assert everything(rounded)[key].dtype == value.dtype, key
+        th.testing.assert_close(everything(rounded)[key], value, rtol=0.05, atol=1e-3, msg=key)
