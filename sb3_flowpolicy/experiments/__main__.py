@@ -1,0 +1,157 @@
+"""`python -m sb3_flowpolicy.experiments`: rerun the thesis's findings and judge them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from sb3_flowpolicy.experiments.costs import in_words, plan_seconds
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
+from sb3_flowpolicy.experiments.progress import Progress
+from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
+from sb3_flowpolicy.experiments.work import FIRST_SEED, SEEDS_PER_ITEM, make_plan
+
+OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Do what the command line says.
+
+    Args:
+        arguments: Command line without the program's name. Default: that of the process.
+
+    Returns:
+        Exit status: 0 if all went well, 1 if not, 130 if interrupted.
+    """
+    args = _parser().parse_args(arguments)
+    try:
+        args.command(args)
+    except KeyboardInterrupt:
+        print("\nInterrupted. The same command goes on from the last checkpoint.", file=sys.stderr)
+        return 130
+    except OSError as error:
+        print(
+            f"error: {error}. What is finished is kept; once this is mended, the same command goes "
+            "on from the last checkpoint",
+            file=sys.stderr,
+        )
+        return 1
+    except (ValueError, RuntimeError, ModuleNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _list(args: argparse.Namespace) -> None:
+    print(f"{'experiment':<22}{'claim':<7}{'agents':>6}{'settings':>9}{'steps':>11}{'seeds':>6}", end="")
+    print(f"{'time':>10}  here?  what it compares")
+    for experiment in EXPERIMENTS.values():
+        missing = what_is_missing(experiment)
+        plan = make_plan(experiment, args.profile)
+        print(
+            f"{experiment.name:<22}{experiment.claim:<7}{len(experiment.agents):>6}"
+            f"{len(experiment.settings):>9}{plan.steps:>11,}{len(plan.seeds):>6}"
+            f"{in_words(plan_seconds(plan, args.workers)):>10}  {'no' if missing else 'yes':<5}  "
+            f"{experiment.title}" + (f" [needs {missing}]" if missing else "")
+        )
+    print(
+        f"\nTimes are estimates for {args.workers} cores like those of docs/results/experiments.md,"
+        " from measured speeds."
+    )
+
+
+def _run(args: argparse.Namespace) -> None:
+    experiment = find(args.name)
+    missing = what_is_missing(experiment)
+    if missing:
+        raise ValueError(f"{experiment.name} needs {missing}, which is not here")
+    plan = make_plan(
+        experiment, args.profile, args.steps, args.seeds, args.first_seed, args.seeds_per_item
+    )
+    out = args.out or OUT[args.profile]
+    with results_folder(out, plan) as folder:
+        items = unfinished(folder, plan)
+        finished = {item.key for item in plan.items} - {item.key for item in items}
+        print(
+            f"{experiment.name} ({experiment.claim}): {len(plan.items)} items of {plan.steps:,} "
+            f"steps x {len(plan.items[0].seeds)} seeds, {len(finished)} finished before, "
+            f"about {in_words(plan_seconds(plan, args.workers))} in all on {args.workers} cores\n"
+            f"Results: {folder}"
+        )
+        if items:
+            with Progress(plan.items, sorted(finished), shown=not args.no_progress) as progress:
+                if args.backend == "ray":
+                    from sb3_flowpolicy.experiments.ray_backend import run_on_ray
+
+                    run_on_ray(folder, items, progress, args.address)
+                else:
+                    run_local(folder, items, progress, args.workers)
+        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    print(f"Finished. python -m sb3_flowpolicy.experiments report --results {out}")
+
+
+def _report(args: argparse.Namespace) -> None:
+    from sb3_flowpolicy.experiments.report import write_docs, write_report
+
+    page = write_report(args.results, args.html or args.results / "report.html")
+    print(f"Report: {page}")
+    if args.docs is not None:
+        print(f"Tables, figures and data: {write_docs(args.results, args.docs)}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.experiments",
+        description="The findings of the thesis, each by one command: `list` shows them, `run` "
+        "trains the agents, `report` draws and judges what was measured.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="list|run|report")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    for name, function, text in (
+        ("list", _list, "show all experiments, what they cost and whether they can run here"),
+        ("run", _run, "run one experiment, or go on with it after an interruption"),
+        ("report", _report, "write one HTML page from all results, and the tables for the docs"),
+    ):
+        command = commands.add_parser(
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        command.set_defaults(command=function)
+        add = command.add_argument
+        if name == "run":
+            add("name", metavar="NAME", help="experiment; `list` shows them")
+            add("--seeds", type=int, help="number of seeds (default: the experiment's)")
+            add("--first-seed", type=int, default=FIRST_SEED, help="1 for results, 100 for tuning")
+            add("--steps", type=int, help="steps per seed (default: the experiment's)")
+            add("--backend", choices=("local", "ray"), default="local", help="where to run")
+            add("--address", help="Ray cluster to join, 'auto' for the one this machine is in")
+            add("--out", type=Path, help=f"folder for results (default: {OUT['full']})")
+            add(
+                "--seeds-per-item",
+                type=int,
+                default=SEEDS_PER_ITEM,
+                help="seeds trained together in a process; fewer spread over more machines",
+            )
+            add("--no-progress", action="store_true", help="show no progress bars")
+        if name in ("list", "run"):
+            add(
+                "--profile",
+                choices=("full", "quick"),
+                default="full",
+                help="quick: two seeds and few steps, to see that everything works",
+            )
+            add("--workers", type=int, default=cores, help="processes at a time, one core each")
+        if name == "report":
+            add("--results", type=Path, default=OUT["full"], help="folder that `run` wrote")
+            add("--html", type=Path, help="page to write (default: report.html in it)")
+            add("--docs", type=Path, help="also write Markdown, PNG figures and data there")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,53 @@
+"""How long an experiment takes here, from a table of measured speeds."""
+
+from __future__ import annotations
+
+from sb3_flowpolicy.experiments.work import Plan, WorkItem
+
+STEPS_PER_SECOND = {
+    16: {"sac_gauss": 3000.0, "sac_lowrank": 2400.0, "sac_flow": 2200.0},
+    128: {"sac_gauss": 390.0, "sac_lowrank": 370.0, "sac_flow": 340.0},
+    256: {"sac_gauss": 100.0, "sac_lowrank": 98.0, "sac_flow": 95.0},
+}
+"""Units of the critics' layers -> agent -> steps per second, summed over ten seeds of one process
+with one thread, measurements included, on one of two cores of an AMD EPYC.
+
+16 and 128: ``steps_per_second`` in the ``.done.json`` of runs. 256: updates of single agents
+(docs/benchmarks.md), as ten seeds gain nothing where matrix products are the limit. All blocks do
+one update per step, which is what takes the time.
+"""
+
+_START_SECONDS = 40
+"""Starting a process and compiling."""
+
+
+def item_seconds(item: WorkItem) -> float:
+    """Estimate the time of an item on one core, seconds."""
+    settings = item.hyperparameters
+    net_arch = settings.get("policy_kwargs", {}).get("net_arch", [256, 256])
+    critic = net_arch["qf"] if isinstance(net_arch, dict) else net_arch
+    width = min(STEPS_PER_SECOND, key=lambda known: abs(known - max(critic)))
+    algo = {"GaussPolicy": "sac_gauss", "LowRankPolicy": "sac_lowrank"}.get(
+        settings["policy"], "sac_flow"
+    )
+    return _START_SECONDS + item.steps * len(item.seeds) / STEPS_PER_SECOND[width][algo]
+
+
+def plan_seconds(plan: Plan, workers: int) -> float:
+    """Estimate the time of a plan: the longest items first, each to whoever is free."""
+    loads = [0.0] * max(1, workers)
+    for seconds in sorted((item_seconds(item) for item in plan.items), reverse=True):
+        loads[loads.index(min(loads))] += seconds
+    return max(loads)
+
+
+def in_words(seconds: float) -> str:
+    """Return a time as people say it.
+
+    Example:
+        >>> in_words(95), in_words(5000), in_words(200_000)
+        ('2 min', '1.4 h', '2.3 days')
+    """
+    if seconds < 3600:
+        return f"{max(1, round(seconds / 60))} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 86_400 else f"{seconds / 86_400:.1f} days"

@@ -1,0 +1,193 @@
+"""What was measured, in the words that rules and tables use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_flowpolicy.experiments.experiment import Experiment
+from sb3_flowpolicy.experiments.statistics import common_grid, on_grid, running_mean, swings
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row, read_json
+
+# The share of evaluations, at the end of training, that "final" refers to, and the least number.
+FINAL_SHARE, FINAL_LEAST = 0.1, 3
+# Success rate of deterministic episodes from which on a seed has solved its task.
+SOLVED = 0.8
+# Evaluations in a row that have to show it, for "at its best" and for "steps until solved".
+IN_A_ROW = 3
+
+OSCILLATIONS = {"train_return": 0.3, "entropy": 1.0, "log_ent_coef": 0.4}
+"""What counts as a swing: a quarter of the return, a nat, half again of the temperature."""
+SWINGS_OF_AN_OSCILLATION = 3
+"""Up, down and up again, or the reverse: a single overshoot is no oscillation."""
+
+
+class Evidence:
+    """Results of one experiment.
+
+    Args:
+        experiment: The experiment.
+        folder: Its folder; items that are missing there are simply absent.
+        others: Looks up the evidence of another experiment, None if there is none.
+
+    Raises:
+        ValueError: If a file is corrupt.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        folder: Path,
+        others: Callable[[str], Evidence | None] = lambda name: None,
+    ) -> None:
+        self.experiment, self.folder, self.others = experiment, folder, others
+        path = folder / "settings.json"
+        self.settings = read_json(path) if path.is_file() else {}
+        self.items: dict[str, dict[str, Any]] = self.settings.get("items", {})
+        self.files = {key: ItemFiles(folder, key) for key in self.items}
+        self.done = {key: files.read_done() for key, files in self.files.items()}
+
+    @property
+    def complete(self) -> bool:
+        """Whether all items are finished."""
+        return bool(self.items) and all(self.done.values())
+
+    @property
+    def seeds(self) -> list[int]:
+        """All seeds of the run."""
+        return self.settings.get("seeds", [])
+
+    @cached_property
+    def _logs(self) -> dict[tuple[str, str], dict[int, list[Row]]]:
+        logs: dict[tuple[str, str], dict[int, list[Row]]] = {}
+        for key, item in self.items.items():
+            seeds = logs.setdefault((item["setting"], item["agent"]), {})
+            for row in self.files[key].read_rows():
+                seeds.setdefault(int(row["seed"] or 0), []).append(row)
+        return logs
+
+    @cached_property
+    def _details(self) -> dict[tuple[str, str], list[dict[str, Any]]]:
+        details: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for key, item in self.items.items():
+            found = details.setdefault((item["setting"], item["agent"]), [])
+            found += self.files[key].read_details()
+        return details
+
+    def has(self, setting: str, agent: str) -> bool:
+        """Whether there is anything of this agent on this setting."""
+        return bool(self._logs.get((setting, agent)))
+
+    def columns(self, setting: str, agent: str) -> list[str]:
+        """Return what was measured of every seed of this agent."""
+        logs = self._logs.get((setting, agent), {})
+        if not logs:
+            return []
+        names = [name for name in next(iter(logs.values()))[0] if name not in BASIC_COLUMNS[:3]]
+        return [
+            name
+            for name in names
+            if all(any(row[name] is not None for row in rows) for rows in logs.values())
+        ]
+
+    def curves(self, setting: str, agent: str, metric: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return a metric of all seeds on a common grid.
+
+        Returns:
+            Steps (T,) and values (S, T); the grid ends where the shortest log does.
+
+        Raises:
+            KeyError: If it was not measured.
+        """
+        logs = self._logs[setting, agent]
+        if metric not in self.columns(setting, agent):
+            raise KeyError(f"{metric} of {agent} on {setting}")
+        steps = [np.array([row["step"] for row in rows], np.float64) for rows in logs.values()]
+        values = [
+            np.array([np.nan if row[metric] is None else row[metric] for row in rows], np.float64)
+            for rows in logs.values()
+        ]
+        grid = common_grid(steps)
+        return grid, np.stack([on_grid(grid, *log) for log in zip(steps, values, strict=True)])
+
+    def final(self, setting: str, agent: str, metric: str) -> np.ndarray:
+        """Return each seed's mean over the last tenth of its evaluations, (S,)."""
+        _, values = self.curves(setting, agent, metric)
+        return values[:, -max(FINAL_LEAST, round(FINAL_SHARE * values.shape[1])) :].mean(1)
+
+    def best(self, setting: str, agent: str, metric: str) -> np.ndarray:
+        """Return each seed's best mean over three evaluations in a row, (S,)."""
+        _, values = self.curves(setting, agent, metric)
+        return running_mean(values, IN_A_ROW)[:, IN_A_ROW - 1 :].max(1, initial=-np.inf)
+
+    def solved(self, setting: str, agent: str) -> np.ndarray:
+        """Return which seeds succeed at the end, (S,)."""
+        return self.final(setting, agent, "test_success") >= SOLVED
+
+    def solved_once(self, setting: str, agent: str) -> np.ndarray:
+        """Return which seeds succeed at their best, (S,)."""
+        return self.best(setting, agent, "test_success") >= SOLVED
+
+    def steps_until_solved(self, setting: str, agent: str) -> np.ndarray:
+        """Return the step at which each seed first succeeds in a row of evaluations, (S,).
+
+        Those that never do count with the length of training: a lower bound.
+        """
+        steps, values = self.curves(setting, agent, "test_success")
+        reached = running_mean(values, IN_A_ROW) >= SOLVED
+        reached[:, : IN_A_ROW - 1] = False
+        return np.where(reached.any(1), steps[reached.argmax(1)], steps[-1])
+
+    def oscillations(self, setting: str, agent: str) -> np.ndarray:
+        """Return the number of swings of each seed, the least over the three curves, (S,).
+
+        Counted from the first training success on, in training return, entropy and the logarithm
+        of the temperature, each averaged over three evaluations: the thesis sees all three swing
+        together, so the curve that swings least decides.
+        """
+        _, success = self.curves(setting, agent, "train_success")
+        counts = []
+        for metric, amplitude in OSCILLATIONS.items():
+            _, values = self.curves(setting, agent, metric.removeprefix("log_"))
+            curves = np.log(values) if metric.startswith("log_") else values
+            smooth = running_mean(curves, IN_A_ROW)
+            counts.append(
+                [
+                    swings(curve[start:], amplitude)
+                    for curve, start in zip(smooth, _first(success > 0), strict=True)
+                ]
+            )
+        return np.min(counts, axis=0)
+
+    def profile(self, setting: str, agent: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return shares of the way (K,) and the entropy there (S, K) at the end of training."""
+        found = [
+            one for one in self._details.get((setting, agent), []) if one["kind"] == "profile"
+        ]
+        if not found:
+            return None
+        return np.array(found[0]["way"]), np.array([one["entropy"] for one in found])
+
+    def front_loading(self, setting: str, agent: str) -> np.ndarray:
+        """Return each seed's entropy on the first third of the way less that on the last, (S,)."""
+        profile = self.profile(setting, agent)
+        if profile is None:
+            raise KeyError(f"profile of {agent} on {setting}")
+        third = len(profile[0]) // 3
+        return profile[1][:, :third].mean(1) - profile[1][:, -third:].mean(1)
+
+    def pictures(self, setting: str, agent: str) -> list[dict[str, Any]]:
+        """Return the recorded policies, in order of steps."""
+        found = self._details.get((setting, agent), [])
+        return sorted(
+            (one for one in found if one["kind"] == "picture"), key=lambda one: one["step"]
+        )
+
+
+def _first(flags: np.ndarray) -> np.ndarray:
+    """Return the index of each row's first True, the length of the row if there is none."""
+    return np.where(flags.any(1), flags.argmax(1), flags.shape[1] - 1)

@@ -1,0 +1,148 @@
+"""What an experiment is: a claim, the runs that test it, and the rule that judges them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_flowpolicy.experiments.evidence import Evidence
+
+REPRODUCED, PARTLY, NOT_REPRODUCED, NOT_MEASURED = (
+    "reproduced",
+    "partly reproduced",
+    "not reproduced",
+    "not measured",
+)
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A column of the comparison.
+
+    Attributes:
+        name: Name in commands and file names.
+        label: Name in figures.
+        algo: File of ``zoo_hyperparams`` that holds its hyperparameters.
+        overrides: What differs from that file, merged into nested mappings.
+    """
+
+    name: str
+    label: str
+    algo: str
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+GAUSS = Agent("gauss", "Gauss", "sac_gauss")
+LOW_RANK = Agent("lowrank", "LR", "sac_lowrank")
+FLOW = Agent("flow", "NF", "sac_flow")
+FLOW_DEFAULT_INIT = Agent(
+    "flow-default-init",
+    "NF, torch's initialisation",
+    "sac_flow",
+    {"policy_kwargs": {"distribution_kwargs": {"init": "default"}}},
+)
+AGENTS = (GAUSS, LOW_RANK, FLOW)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An environment with hyperparameters; every agent of the experiment is trained on it.
+
+    Attributes:
+        name: Name in commands and file names.
+        env_id: Registered environment.
+        env_kwargs: Arguments in which the environment differs from its registration.
+        block: Block of ``zoo_hyperparams``. Default: that of ``env_id``.
+        overrides: What differs from the block, for all agents.
+    """
+
+    name: str
+    env_id: str
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    block: str | None = None
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found: whether it holds, None if it could not be measured, and the numbers."""
+
+    holds: bool | None
+    measured: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of an experiment's rule: a statement and how to test it."""
+
+    statement: str
+    test: Callable[[Evidence], Finding]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A claim of the thesis, or one of ours, and everything needed to test it.
+
+    Attributes:
+        name: Name in commands and folders.
+        claim: Number of the claim; E1 to E11 follow the thesis, D2 and up are ours.
+        source: Section and figures of the thesis.
+        title: One line that says what is compared.
+        thesis: What the thesis found, in our words.
+        settings: Environments with hyperparameters.
+        checks: The rule: all hold, reproduced; none, not reproduced; else partly.
+        agents: Who is compared.
+        steps: Environment steps per seed.
+        seeds: Number of seeds; they are 1, 2, ...
+        eval_every: Steps between two measurements.
+        test_episodes: Deterministic episodes per seed and measurement.
+        measures: Names of further measurements, see ``measures.py``.
+        pictures_at: When to record the first seed's policy along an episode, as shares of
+            ``steps``; only on two-dimensional Tunnels.
+        notes: What a reader should know about how it was set up.
+    """
+
+    name: str
+    claim: str
+    source: str
+    title: str
+    thesis: str
+    settings: tuple[Setting, ...]
+    checks: tuple[Check, ...]
+    agents: tuple[Agent, ...] = AGENTS
+    steps: int = 60_000
+    seeds: int = 10
+    eval_every: int = 1000
+    test_episodes: int = 10
+    measures: tuple[str, ...] = ()
+    pictures_at: tuple[float, ...] = ()
+    notes: str = ""
+
+    def setting(self, name: str) -> Setting:
+        """Return the setting of that name."""
+        return next(one for one in self.settings if one.name == name)
+
+    def agent(self, name: str) -> Agent:
+        """Return the agent of that name."""
+        return next(one for one in self.agents if one.name == name)
+
+    def judge(self, evidence: Evidence) -> tuple[str, list[Finding]]:
+        """Apply the rule.
+
+        Args:
+            evidence: What was measured.
+
+        Returns:
+            The verdict and what each check found.
+        """
+        if not evidence.complete:
+            return NOT_MEASURED, [Finding(None, "runs are missing") for _ in self.checks]
+        findings = [check.test(evidence) for check in self.checks]
+        if any(finding.holds is None for finding in findings):
+            return NOT_MEASURED, findings
+        held = [finding.holds for finding in findings]
+        if all(held):
+            return REPRODUCED, findings
+        return (PARTLY if any(held) else NOT_REPRODUCED), findings

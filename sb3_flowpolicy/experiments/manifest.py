@@ -1,0 +1,51 @@
+"""All experiments: one entry per claim."""
+
+from __future__ import annotations
+
+import difflib
+
+import gymnasium as gym
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.experiments.experiment import Experiment
+from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS
+from sb3_flowpolicy.experiments.measures import MEASURES
+from sb3_flowpolicy.experiments.tunnel_claims import TUNNEL_CLAIMS
+
+EXPERIMENTS: dict[str, Experiment] = {
+    one.name: one for one in (*FURTHER_CLAIMS[:2], *TUNNEL_CLAIMS, *FURTHER_CLAIMS[2:])
+}
+"""Name to experiment, in the order of the claims."""
+
+_KNOWN_MEASURES = {"profile", *MEASURES}
+
+
+def find(name: str) -> Experiment:
+    """Return the experiment of that name.
+
+    Raises:
+        ValueError: If there is none; the message says what there is.
+
+    Example:
+        >>> find("sparse-fixed-alpha").claim
+        'E5'
+    """
+    if name not in EXPERIMENTS:
+        close = difflib.get_close_matches(name, EXPERIMENTS, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"name must be one of {', '.join(EXPERIMENTS)}, got {name!r}{hint}")
+    return EXPERIMENTS[name]
+
+
+def what_is_missing(experiment: Experiment) -> str | None:
+    """Say what an experiment needs that is not here; None if it can run."""
+    for setting in experiment.settings:
+        if setting.env_id.endswith("BulletEnv-v0"):
+            try:
+                import pybullet_envs_gymnasium  # noqa: F401, registers the environments
+            except ModuleNotFoundError:
+                return 'PyBullet: pip install "sb3_flowpolicy[bullet]"'
+        if setting.env_id not in gym.registry:
+            return f"the environment {setting.env_id}"
+    unknown = [name for name in experiment.measures if name not in _KNOWN_MEASURES]
+    return f"measurements of {', '.join(unknown)}" if unknown else None

@@ -1,0 +1,181 @@
+"""What is measured of a policy, besides what training itself reports.
+
+All measurements draw from generators of their own: a run that is measured and one that is not are
+the same run, and measuring twice gives the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium.vector import VectorEnv
+
+from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.sac_flow import SACFlow
+from sb3_flowpolicy.seed_setup import make_env, make_vec_env
+
+N_STATES, N_SAMPLES = 256, 64
+PROFILE_POINTS, PROFILE_SAMPLES = 36, 512
+PICTURE_STATES, PICTURE_SAMPLES = 4, 150
+
+
+@contextmanager
+def own_random_numbers(*seed: int) -> Iterator[np.random.Generator]:
+    """Draw from a fresh generator, and leave torch's as it was."""
+    sequence = np.random.SeedSequence(seed)
+    with th.random.fork_rng(devices=[]), th.no_grad():
+        th.manual_seed(int(sequence.generate_state(1)[0]))
+        yield np.random.default_rng(sequence)
+
+
+def actor_of(model: SACFlow) -> FlowActor:
+    """Return the model's actor."""
+    assert isinstance(model.actor, FlowActor)
+    return model.actor
+
+
+def policy_entropy(model: SACFlow, seed: int) -> float:
+    """Estimate the policy's mean entropy at states of the replay buffer, nats."""
+    obs = _buffer_states(model, seed)
+    with own_random_numbers(seed, model.num_timesteps, 1):
+        return actor_of(model).entropy(obs, N_SAMPLES).mean().item()
+
+
+def same_axis_correlation(model: SACFlow, seed: int) -> float:
+    """Mean absolute correlation of action pairs of the same axis (thesis Fig. 3.17).
+
+    The actions are x and y of each finger in turn: pairs of even and of odd indices.
+    """
+    obs = _buffer_states(model, seed)[:64]
+    with own_random_numbers(seed, model.num_timesteps, 2):
+        correlation = actor_of(model).action_correlation(obs).abs().mean(0)
+    index = th.arange(len(correlation))
+    same = (index[:, None] % 2 == index % 2) & (index[:, None] != index)
+    return correlation[same].mean().item()
+
+
+def _buffer_states(model: SACFlow, seed: int) -> th.Tensor:
+    buffer = model.replay_buffer
+    assert buffer is not None
+    with own_random_numbers(seed, model.num_timesteps, 0) as rng:
+        rows = rng.integers(0, buffer.size(), N_STATES)
+    return th.as_tensor(buffer.observations[rows, 0])
+
+
+MEASURES: dict[str, Callable[[SACFlow, int], float]] = {
+    "same_axis_correlation": same_axis_correlation
+}
+"""Further columns of a table; an experiment names those it wants."""
+
+
+class TestEpisodes:
+    """Deterministic episodes of several policies, all stepped at once.
+
+    Args:
+        env: Environment.
+        n_models: Number of policies.
+        n_episodes: Number of episodes of each.
+    """
+
+    def __init__(self, env: str, n_models: int, n_episodes: int) -> None:
+        self.n_models, self.n_episodes = n_models, n_episodes
+        self.venv: VectorEnv = make_vec_env(env, n_models * n_episodes)
+
+    def run(self, models: list[SACFlow], seeds: tuple[int, ...]) -> list[tuple[float, float | None]]:
+        """Return mean return and success rate of each policy.
+
+        Episodes start from the same seeds at every call, far from those of training. The success
+        rate is None where the environment does not tell.
+        """
+        offsets = [10**6 * (seed + 1) + k for seed in seeds for k in range(self.n_episodes)]
+        obs, _ = self.venv.reset(seed=offsets)  # type: ignore[arg-type]
+        count = len(offsets)
+        returns, running = np.zeros(count), np.ones(count, dtype=bool)
+        success: np.ndarray | None = None
+        while running.any():
+            obs, rewards, terminated, truncated, infos = self.venv.step(self._act(models, obs))
+            returns += rewards * running
+            ended = (terminated | truncated) & running
+            told = infos.get("final_info", {}).get("is_success")
+            if ended.any() and told is not None:
+                success = np.zeros(count) if success is None else success
+                success[ended] = np.asarray(told)[ended]
+            running &= ~ended
+        shape = (self.n_models, self.n_episodes)
+        means = returns.reshape(shape).mean(1).tolist()
+        if success is None:
+            return [(mean, None) for mean in means]
+        return list(zip(means, success.reshape(shape).mean(1).tolist(), strict=True))
+
+    def _act(self, models: list[SACFlow], obs: np.ndarray) -> np.ndarray:
+        parts = np.split(obs, self.n_models)
+        return np.concatenate(
+            [model.predict(part, deterministic=True)[0] for model, part in zip(models, parts, strict=True)]
+        )
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.venv.close()
+
+
+def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[float]] | None:
+    """Estimate the entropy at points of the centre line from start to goal.
+
+    Returns:
+        ``way``, shares of the way to the goal in [0, 1), and ``entropy`` in nats; None for
+        environments other than the Tunnel.
+    """
+    env = make_env(env_id).unwrapped
+    config = getattr(env, "config", None)
+    if config is None or not hasattr(config, "geometry"):
+        return None
+    way = np.arange(PROFILE_POINTS) / PROFILE_POINTS
+    arcs = way * config.geometry.goal_arcs[0]
+    points = np.stack([config.geometry.point(arc) for arc in arcs])
+    if config.path == "circle":
+        radii = np.column_stack([np.full(len(points), config.radius), np.linalg.norm(points, axis=1)])
+        points = np.concatenate([points, radii], axis=1)
+    with own_random_numbers(seed, model.num_timesteps, 3):
+        entropy = actor_of(model).entropy(th.as_tensor(points.astype(np.float32)), PROFILE_SAMPLES)
+    return {"way": _rounded(way), "entropy": _rounded(entropy.numpy())}
+
+
+def policy_picture(model: SACFlow, env_id: str, seed: int) -> dict[str, Any] | None:
+    """Record action samples at several states of one deterministic episode.
+
+    Returns:
+        ``steps``, ``positions`` and ``samples`` (actions), at states spread evenly over the
+        episode, and ``trail``, all its positions; None unless the environment is a
+        two-dimensional Tunnel.
+    """
+    env: gym.Env = make_env(env_id)
+    if not hasattr(env.unwrapped, "set_action_samples") or env.action_space.shape != (2,):
+        return None
+    obs, _ = env.reset(seed=seed)
+    states, done = [obs], False
+    while not done:
+        action, _ = model.predict(obs, deterministic=True)
+        obs, _, terminated, truncated, _ = env.step(action)
+        states.append(obs)
+        done = terminated or truncated
+    trail = np.stack(states)
+    chosen = np.unique(np.linspace(0, len(states) - 2, PICTURE_STATES).round().astype(int))
+    actor = actor_of(model)
+    with own_random_numbers(seed, model.num_timesteps, 4):
+        batch = th.as_tensor(np.repeat(trail[chosen], PICTURE_SAMPLES, axis=0))
+        samples = model.policy.unscale_action(actor(batch).numpy())
+    return {
+        "steps": chosen.tolist(),
+        "positions": _rounded(trail[chosen, :2]),
+        "samples": _rounded(samples.reshape(len(chosen), PICTURE_SAMPLES, 2)),
+        "trail": _rounded(trail[:, :2]),
+    }
+
+
+def _rounded(values: np.ndarray) -> list:
+    return np.round(np.asarray(values, np.float64), 4).tolist()

@@ -1,0 +1,138 @@
+"""Doing all work items of a plan on this machine, one process per core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from sb3_flowpolicy.experiments.progress import Progress
+from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
+from sb3_flowpolicy.experiments.work import Plan, WorkItem
+
+# Read by OpenMP and numba when a process starts: one thread each, as many processes as cores.
+_ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_reports: Any = None
+
+
+@contextmanager
+def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
+    """Claim the folder of an experiment for as long as a run lasts.
+
+    Args:
+        out: Folder of all experiments.
+        plan: What is going to be run.
+
+    Yields:
+        The experiment's own folder.
+
+    Raises:
+        ValueError: If it holds results of other settings, or another run is at work.
+        OSError: If it cannot be written.
+    """
+    folder = out / plan.experiment.name
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / ".run.lock", timeout=0):
+            claim_folder(folder, plan.settings())
+            yield folder
+    except Timeout as error:
+        raise ValueError(f"{folder} must be used by one run at a time, but another is") from error
+
+
+def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
+    """Return the items that are still to be done."""
+    return [item for item in plan.items if not ItemFiles(folder, item.key).finished]
+
+
+def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
+    """Do items in processes of this machine.
+
+    Args:
+        folder: Folder of the experiment, claimed.
+        items: What to do.
+        progress: Shows how far they are.
+        workers: Number of processes, at least 1.
+
+    Raises:
+        ValueError: If an item's files are damaged.
+        OSError: If a file cannot be written.
+        RuntimeError: If a process died.
+    """
+    context = multiprocessing.get_context("spawn")
+    reports = context.Queue()
+    with (
+        _one_thread_each(),
+        ProcessPoolExecutor(
+            min(workers, len(items)), context, initializer=_start_worker, initargs=(reports,)
+        ) as pool,
+    ):
+        running: set[Future] = {pool.submit(_work, item, folder) for item in items}
+        try:
+            while running:
+                _pass_on(reports, progress)
+                done, running = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in done:
+                    future.result()
+            _pass_on(reports, progress)
+        except BrokenProcessPool as error:
+            raise RuntimeError(
+                "a process was killed, for want of memory perhaps; the same command goes on from "
+                "the last checkpoint, --workers 1 needs the least memory"
+            ) from error
+        except BaseException:
+            # Others would run to their end, which may be hours away.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _pass_on(reports: Any, progress: Progress) -> None:
+    while True:
+        try:
+            progress.update(*reports.get_nowait())
+        except queue.Empty:
+            return
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start_worker(reports: Any) -> None:
+    global _reports
+    _reports = reports
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        parent.join()
+        os._exit(1)  # a runner that was killed must not leave processes that go on writing
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def _work(item: WorkItem, folder: Path) -> None:
+    from sb3_flowpolicy.experiments.training import run_item
+
+    run_item(item, folder, lambda key, step: _reports.put((key, step)))

@@ -1,0 +1,155 @@
+"""Statistics over seeds, by rliable's definitions (Agarwal et al., 2021, arXiv:2108.13264)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rliable import library, metrics
+from scipy.stats import trim_mean
+
+RESAMPLES = 2000
+# Intervals are part of the published tables: the same data give the same digits.
+_BOOTSTRAP_SEED = 20200901
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A point estimate and its 95 % interval: numbers, or arrays over steps."""
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __format__(self, spec: str) -> str:
+        """Format a single number as ``value (low, high)``."""
+        spec = spec or ".2f"
+        return f"{self.value:{spec}} ({self.low:{spec}}, {self.high:{spec}})"
+
+
+def interquartile_mean(values: np.ndarray) -> Estimate:
+    """Mean of the middle half of the seeds, with a stratified bootstrap interval.
+
+    Args:
+        values: One value per seed, (S,), or a curve per seed, (S, T). Finite.
+
+    Returns:
+        Estimates of shape () or (T,); the interval of a curve holds at each step on its own.
+
+    Raises:
+        ValueError: If there are no seeds, or values are not finite.
+
+    Example:
+        >>> estimate = interquartile_mean(np.array([0.0, 1.0, 1.0, 9.0]))
+        >>> float(estimate.value)
+        1.0
+    """
+    values = np.asarray(values, np.float64)
+    if values.ndim not in (1, 2) or values.size == 0 or not np.isfinite(values).all():
+        raise ValueError(f"values must be finite, (S,) or (S, T), got {values}")
+    # rliable wants (runs, tasks, ...); the seeds of a setting are the runs of one task.
+    scores = {"runs": values.reshape(len(values), 1, -1)}
+
+    def iqm(runs: np.ndarray) -> np.ndarray:
+        return trim_mean(runs[:, 0], 0.25, axis=0)
+
+    points, intervals = library.get_interval_estimates(
+        scores, iqm, reps=RESAMPLES, random_state=np.random.RandomState(_BOOTSTRAP_SEED)
+    )
+    shape = values.shape[1:]
+    low, high = intervals["runs"].reshape(2, *shape)
+    return Estimate(points["runs"].reshape(shape), low, high)
+
+
+def probability_of_improvement(better: np.ndarray, worse: np.ndarray) -> Estimate:
+    """Probability that a run of one agent ends above a run of the other, ties counting half.
+
+    Args:
+        better: Values of one agent, (S,).
+        worse: Values of the other, (S',).
+
+    Returns:
+        The estimate, in [0, 1].
+
+    Example:
+        >>> float(probability_of_improvement(np.arange(3.0), np.arange(3.0)).value)
+        0.5
+    """
+    scores = {"pair": [np.asarray(v, np.float64)[:, None] for v in (better, worse)]}
+    points, intervals = library.get_interval_estimates(
+        scores,
+        lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
+        reps=RESAMPLES // 4,
+        random_state=np.random.RandomState(_BOOTSTRAP_SEED),
+    )
+    low, high = intervals["pair"][:, 0]
+    return Estimate(points["pair"][0], low, high)
+
+
+def common_grid(steps: Sequence[np.ndarray]) -> np.ndarray:
+    """Return all steps at which any seed was measured, up to where the shortest log ends.
+
+    Example:
+        >>> common_grid([np.array([1, 2, 3]), np.array([2, 4])]).tolist()
+        [1, 2, 3]
+    """
+    last = min(one[-1] for one in steps)
+    grid = np.unique(np.concatenate(list(steps)))
+    return grid[grid <= last]
+
+
+def on_grid(grid: np.ndarray, steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate a log linearly; before its first value it is taken to be constant.
+
+    Args:
+        grid: Where values are wanted, (T,).
+        steps: Where values were measured, increasing.
+        values: What was measured; NaN where nothing was, but not everywhere.
+
+    Returns:
+        Values at the grid, (T,).
+    """
+    known = np.isfinite(values)
+    return np.interp(grid, steps[known], values[known])
+
+
+def running_mean(values: np.ndarray, window: int) -> np.ndarray:
+    """Average each value with up to ``window - 1`` before it, along the last axis.
+
+    Example:
+        >>> running_mean(np.array([0.0, 1.0, 1.0]), 2).tolist()
+        [0.0, 0.5, 1.0]
+    """
+    sums = np.cumsum(values, axis=-1)
+    sums[..., window:] -= sums[..., :-window].copy()
+    return sums / np.minimum(np.arange(values.shape[-1]) + 1, window)
+
+
+def swings(values: np.ndarray, amplitude: float) -> int:
+    """Count how often a curve turns round after moving at least ``amplitude`` one way.
+
+    Small wiggles do not count: a turn is one only if the curve then moves by ``amplitude`` the
+    other way, too. A monotonic curve has none, a sine over three periods five or six.
+
+    Args:
+        values: The curve, (T,).
+        amplitude: Least difference between a high and the low that follows, above 0.
+
+    Example:
+        >>> swings(np.sin(np.linspace(0, 6 * np.pi, 200)), 1.5)
+        5
+        >>> swings(np.linspace(0, 9, 50), 1.5)
+        0
+    """
+    low = high = values[0]
+    direction, turns = 0, 0
+    for value in values[1:]:
+        low, high = min(low, value), max(high, value)
+        if direction >= 0 and high - value >= amplitude:
+            turns += direction
+            direction, low = -1, value
+        elif direction <= 0 and value - low >= amplitude:
+            turns -= direction
+            direction, high = 1, value
+    return turns

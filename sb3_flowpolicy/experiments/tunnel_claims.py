@@ -1,0 +1,152 @@
+"""Claims E2 to E6 (thesis 3.2, the Tunnel), and one of our own."""
+
+from __future__ import annotations
+
+from sb3_flowpolicy.experiments.experiment import (
+    AGENTS,
+    FLOW,
+    FLOW_DEFAULT_INIT,
+    GAUSS,
+    LOW_RANK,
+    Experiment,
+    Setting,
+)
+from sb3_flowpolicy.experiments.rules import (
+    about_equal,
+    at_least_times,
+    front_loads,
+    is_steady,
+    mostly_fails,
+    no_better_than,
+    none_fails,
+    ordered,
+    oscillates,
+    slower,
+    solved,
+)
+
+LEARNED = {"ent_coef": "auto"}
+DIMENSIONS = (2, 4, 8, 16, 32)
+
+_SPARSE = (
+    Setting("horizontal", "TunnelHorizontal-v0"),
+    Setting("diagonal", "TunnelDiagonal-v0"),
+)
+_HORIZONTAL_ALIKE = tuple(solved("horizontal", agent, 0.9, at_best=True) for agent in AGENTS)
+
+TUNNEL_CLAIMS = (
+    Experiment(
+        name="circle-fixed-alpha",
+        claim="E2",
+        source="section 3.2.2, figures 3.4 to 3.6",
+        title="Circle with dense reward, fixed temperature: whose entropy collapses?",
+        thesis="All agents end with about the same return. Gauss takes longer and gives up much "
+        "more entropy; NF keeps more than LR. One of five NF seeds learned nothing.",
+        settings=(Setting("circle", "TunnelCircle-v0"),),
+        agents=(*AGENTS, FLOW_DEFAULT_INIT),
+        checks=(
+            about_equal("circle", "test_return", AGENTS, 0.1),
+            ordered("circle", "entropy", (FLOW, LOW_RANK, GAUSS)),
+            slower("circle", GAUSS, (LOW_RANK, FLOW)),
+            none_fails("circle", FLOW),
+        ),
+        measures=("profile",),
+        pictures_at=(0.1, 0.25, 1.0),
+        notes="The thesis's flow started from torch's default weights; ours starts as a standard "
+        "normal. The fourth agent starts as the thesis's did, to count the seeds that fail.",
+    ),
+    Experiment(
+        name="circle-fixed-entropy",
+        claim="E3",
+        source="section 3.2.3, figures 3.7 and 3.8",
+        title="Circle with dense reward, learned temperature: where does the entropy go?",
+        thesis="With exploration NF collects about twice Gauss's return, without it they are "
+        "equal. Gauss meets the entropy target on the first steps, where it costs least.",
+        settings=(Setting("circle", "TunnelCircle-v0", overrides=LEARNED),),
+        checks=(
+            at_least_times("circle", "train_return", FLOW, GAUSS, 1.5),
+            about_equal("circle", "test_return", (FLOW, GAUSS), 0.1),
+            front_loads("circle", GAUSS, FLOW, 0.5),
+            none_fails("circle", FLOW),
+        ),
+        measures=("profile",),
+        pictures_at=(1.0,),
+        notes="The target is minus the dimension of the action space. 'About twice' is taken to "
+        "be at least 1.5 times.",
+    ),
+    Experiment(
+        name="circle-narrow",
+        claim="E4",
+        source="section 3.2.3, figure 3.9",
+        title="Narrower circle, larger final reward, learned temperature: who oscillates?",
+        thesis="Once Gauss has found the goal, its return, entropy and temperature swing up and "
+        "down together, in every seed; those of NF and LR do not.",
+        settings=(Setting("narrow", "TunnelCircleNarrow-v0"),),
+        checks=(
+            oscillates("narrow", GAUSS, 1.0),
+            is_steady("narrow", LOW_RANK, 0.0),
+            is_steady("narrow", FLOW, 0.0),
+        ),
+        eval_every=500,
+        measures=("profile",),
+        pictures_at=(1.0,),
+    ),
+    Experiment(
+        name="sparse-fixed-alpha",
+        claim="E5",
+        source="section 3.2.4, figures 3.2 and 3.10",
+        title="Straight tunnel with sparse reward, fixed temperature: along an axis or diagonally",
+        thesis="Along an axis the agents do not differ, and all lose what they learned later on, "
+        "the temperature being a little too high. Diagonally Gauss fails; NF beats LR.",
+        settings=_SPARSE,
+        checks=(
+            *_HORIZONTAL_ALIKE,
+            mostly_fails("diagonal", GAUSS, 0.3),
+            solved("diagonal", LOW_RANK, 0.9),
+            solved("diagonal", FLOW, 0.9),
+        ),
+        pictures_at=(1.0,),
+        notes="Networks of two layers with 16 units (NF: 4), as in the thesis.",
+    ),
+    Experiment(
+        name="sparse-fixed-entropy",
+        claim="E6",
+        source="section 3.2.4, figure 3.11",
+        title="The same with learned temperature",
+        thesis="The same picture, all agents a little worse than with the fixed temperature. "
+        "Gauss finds the diagonal goal now and then.",
+        settings=tuple(Setting(s.name, s.env_id, overrides=LEARNED) for s in _SPARSE),
+        checks=(
+            *_HORIZONTAL_ALIKE,
+            mostly_fails("diagonal", GAUSS, 0.3),
+            ordered("diagonal", "train_success", (FLOW, GAUSS), 0.2),
+            ordered("diagonal", "train_success", (LOW_RANK, GAUSS), 0.2),
+            no_better_than("sparse-fixed-alpha", "diagonal", (LOW_RANK, FLOW)),
+        ),
+        pictures_at=(1.0,),
+    ),
+    Experiment(
+        name="diagonal-dimensions",
+        claim="D2-32",
+        source="ours",
+        title="The diagonal tunnel in 2 to 32 dimensions: how far does each agent explore?",
+        thesis="Not in the thesis. The share of directions that stay in the tunnel shrinks with "
+        "every dimension, for independent noise much faster than for correlated noise.",
+        settings=tuple(
+            Setting(
+                f"{count}-dimensions",
+                "TunnelDiagonal-v0",
+                env_kwargs={"total_dims": count, "coupled_dims": count},
+            )
+            for count in DIMENSIONS
+        ),
+        checks=tuple(
+            solved(f"{count}-dimensions", agent, 0.9)
+            for count in DIMENSIONS
+            for agent in (LOW_RANK, FLOW)
+        ),
+        eval_every=2000,
+        notes="Everything but the number of dimensions is as in sparse-fixed-alpha. There is no "
+        "claim to reproduce: each line says whether that agent still gets there.",
+    ),
+)

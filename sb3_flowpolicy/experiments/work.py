@@ -1,0 +1,204 @@
+"""From an experiment to work items: one item is one agent on one setting, with its seeds."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.experiments.experiment import Agent, Experiment, Setting
+from sb3_flowpolicy.hyperparameters import load_hyperparameters
+
+FIRST_SEED = 1
+SEEDS_PER_ITEM = 10
+QUICK_STEPS, QUICK_SEEDS = 3000, 2
+EVALUATIONS_PER_CHECKPOINT = 10
+# Raised whenever the files of a run change their meaning.
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class WorkItem:
+    """One :class:`SeedBatch` to train: an agent on a setting.
+
+    Attributes:
+        key: Name of its files.
+        setting: Name of the setting.
+        agent: Name of the agent.
+        seeds: Its seeds.
+        env_id: Environment.
+        env_kwargs: Arguments in which it differs from its registration.
+        hyperparameters: Arguments of the agents, ``policy`` among them.
+        steps: Environment steps per seed.
+        eval_every: Steps between two measurements.
+        checkpoint_every: Steps between two checkpoints; running episodes end there.
+        test_episodes: Test episodes per seed and measurement.
+        measures: Names of further measurements.
+        pictures_at: Steps after which the first seed's policy is recorded.
+    """
+
+    key: str
+    setting: str
+    agent: str
+    seeds: tuple[int, ...]
+    env_id: str
+    env_kwargs: dict[str, Any]
+    hyperparameters: dict[str, Any]
+    steps: int
+    eval_every: int
+    checkpoint_every: int
+    test_episodes: int
+    measures: tuple[str, ...]
+    pictures_at: tuple[int, ...]
+
+    @property
+    def updates(self) -> int:
+        """Number of gradient updates per seed."""
+        settings = self.hyperparameters
+        ratio = settings.get("gradient_steps", 1) / settings.get("train_freq", 1)
+        return max(0, int((self.steps - settings.get("learning_starts", 100)) * ratio))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a run of an experiment will do."""
+
+    experiment: Experiment
+    steps: int
+    seeds: tuple[int, ...]
+    items: tuple[WorkItem, ...]
+
+    def settings(self) -> dict[str, Any]:
+        """Return what results depend on; two runs share a folder only if these are equal."""
+        return {
+            "schema": SCHEMA,
+            "experiment": self.experiment.name,
+            "steps": self.steps,
+            "seeds": list(self.seeds),
+            "items": {item.key: _describe(item) for item in self.items},
+        }
+
+
+def make_plan(
+    experiment: Experiment,
+    profile: str = "full",
+    steps: int | None = None,
+    seeds: int | None = None,
+    first_seed: int = FIRST_SEED,
+    seeds_per_item: int = SEEDS_PER_ITEM,
+) -> Plan:
+    """Turn an experiment into work items.
+
+    Args:
+        experiment: The experiment.
+        profile: ``"full"`` for the experiment's own steps and seeds, ``"quick"`` for a try-out.
+        steps: Environment steps per seed. Default: the profile's.
+        seeds: Number of seeds. Default: the profile's.
+        first_seed: The seeds are this one and those after it.
+        seeds_per_item: How many seeds are trained in one process, at most. Fewer make more items
+            to spread over machines, more make better use of each.
+
+    Returns:
+        The plan.
+
+    Raises:
+        ValueError: If an argument is out of range.
+    """
+    if profile not in ("full", "quick"):
+        raise ValueError(f'profile must be "full" or "quick", got {profile!r}')
+    quick = profile == "quick"
+    steps = (QUICK_STEPS if quick else experiment.steps) if steps is None else steps
+    seeds = (QUICK_SEEDS if quick else experiment.seeds) if seeds is None else seeds
+    least = {"steps": (steps, 1), "seeds": (seeds, 1), "seeds_per_item": (seeds_per_item, 1)}
+    for name, (value, bound) in {**least, "first_seed": (first_seed, 0)}.items():
+        if value < bound:
+            raise ValueError(f"{name} must be at least {bound}, got {value}")
+    chosen = tuple(range(first_seed, first_seed + seeds))
+    groups = [chosen[i : i + seeds_per_item] for i in range(0, seeds, seeds_per_item)]
+    items = [
+        _item(experiment, setting, agent, group, steps, len(groups) > 1)
+        for setting in experiment.settings
+        for agent in experiment.agents
+        for group in groups
+    ]
+    return Plan(experiment, steps, chosen, tuple(items))
+
+
+def _item(
+    experiment: Experiment,
+    setting: Setting,
+    agent: Agent,
+    seeds: Sequence[int],
+    steps: int,
+    split: bool,
+) -> WorkItem:
+    hyperparameters = load_hyperparameters(agent.algo, setting.block or setting.env_id)
+    hyperparameters.pop("n_timesteps", None)
+    for overrides in (setting.overrides, agent.overrides):
+        hyperparameters = merge(hyperparameters, overrides)
+    # A short run is measured more often, or there would be no curve to look at.
+    eval_every = max(1, min(experiment.eval_every, steps // 6))
+    return WorkItem(
+        key=f"{setting.name}-{agent.name}" + (f"-seeds-{seeds[0]}-{seeds[-1]}" if split else ""),
+        setting=setting.name,
+        agent=agent.name,
+        seeds=tuple(seeds),
+        env_id=setting.env_id,
+        env_kwargs=dict(setting.env_kwargs),
+        hyperparameters=hyperparameters,
+        steps=steps,
+        eval_every=eval_every,
+        checkpoint_every=eval_every * EVALUATIONS_PER_CHECKPOINT,
+        test_episodes=experiment.test_episodes,
+        measures=experiment.measures,
+        pictures_at=tuple(round(share * steps) for share in experiment.pictures_at),
+    )
+
+
+def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with ``overrides``, merging nested mappings.
+
+    Example:
+        >>> merge({"a": 1, "b": {"c": 2}}, {"b": {"d": 3}})
+        {'a': 1, 'b': {'c': 2, 'd': 3}}
+    """
+    merged = copy.deepcopy(dict(base))
+    for key, value in overrides.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = merge(merged[key], value) if both else copy.deepcopy(value)
+    return merged
+
+
+def _describe(item: WorkItem) -> dict[str, Any]:
+    described = {name: value for name, value in vars(item).items() if name != "key"}
+    spec = gym.spec(item.env_id)
+    described["env_registration"] = {
+        "kwargs": spec.kwargs,
+        "max_episode_steps": spec.max_episode_steps,
+    }
+    return described
+
+
+def environment(item: WorkItem) -> str:
+    """Return the id of the item's environment, registered with its arguments if need be.
+
+    An id, not a factory: only ids lead to an environment's vectorised form.
+    """
+    if not item.env_kwargs:
+        return item.env_id
+    base = gym.spec(item.env_id)
+    parts = [f"{key}_{value}" for key, value in sorted(item.env_kwargs.items())]
+    name = f"{base.name}-{'-'.join(parts)}-v{base.version}"
+    if name not in gym.registry:
+        gym.register(
+            id=name,
+            entry_point=base.entry_point,
+            vector_entry_point=base.vector_entry_point,
+            max_episode_steps=base.max_episode_steps,
+            kwargs={**base.kwargs, **item.env_kwargs},
+        )
+    return name
