@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rliable import library, metrics
-from scipy.stats import trim_mean
+from scipy.stats import bootstrap, trim_mean
 
 RESAMPLES = 2000
 # Intervals are part of the published tables: the same data give the same digits.
@@ -32,34 +35,81 @@ def interquartile_mean(values: np.ndarray) -> Estimate:
     """Mean of the middle half of the seeds, with a stratified bootstrap interval.
 
     Args:
-        values: One value per seed, (S,), or a curve per seed, (S, T). Finite.
+        values: One value per seed, (S,). Finite.
 
     Returns:
-        Estimates of shape () or (T,); the interval of a curve holds at each step on its own.
+        The estimate.
 
     Raises:
         ValueError: If there are no seeds, or values are not finite.
 
     Example:
-        >>> estimate = interquartile_mean(np.array([0.0, 1.0, 1.0, 9.0]))
-        >>> float(estimate.value)
+        >>> float(interquartile_mean(np.array([0.0, 1.0, 1.0, 9.0])).value)
         1.0
     """
-    values = np.asarray(values, np.float64)
-    if values.ndim not in (1, 2) or values.size == 0 or not np.isfinite(values).all():
-        raise ValueError(f"values must be finite, (S,) or (S, T), got {values}")
-    # rliable wants (runs, tasks, ...); the seeds of a setting are the runs of one task.
-    scores = {"runs": values.reshape(len(values), 1, -1)}
+    values = _checked(values, 1)
+    return _interquartile_mean(tuple(values.tolist()))
 
-    def iqm(runs: np.ndarray) -> np.ndarray:
-        return trim_mean(runs[:, 0], 0.25, axis=0)
 
-    points, intervals = library.get_interval_estimates(
-        scores, iqm, reps=RESAMPLES, random_state=np.random.RandomState(_BOOTSTRAP_SEED)
+@functools.cache
+def _interquartile_mean(values: tuple[float, ...]) -> Estimate:
+    """Remember estimates: page and tables ask for the same ones, at a second each."""
+    # rliable wants (runs, tasks); the seeds of a setting are the runs of one task.
+    return _estimate(
+        np.array(values)[:, None], lambda runs: np.array([metrics.aggregate_iqm(runs)]), RESAMPLES
     )
-    shape = values.shape[1:]
-    low, high = intervals["runs"].reshape(2, *shape)
-    return Estimate(points["runs"].reshape(shape), low, high)
+
+
+def interquartile_curve(values: np.ndarray) -> Estimate:
+    """Do the same at each step of a curve.
+
+    rliable resamples one by one, which takes minutes for a page of curves. With a single task its
+    stratified bootstrap is the ordinary one, and scipy does that at once.
+
+    Args:
+        values: One curve per seed, (S, T). Finite.
+
+    Returns:
+        Estimates of shape (T,); the interval holds at each step on its own.
+
+    Raises:
+        ValueError: If there are no seeds, or values are not finite.
+    """
+    values = _checked(values, 2)
+    mean = trim_mean(values, 0.25, axis=0)
+    if len(values) == 1:
+        return Estimate(mean, mean, mean)
+    resampled = bootstrap(
+        (values,),
+        lambda runs, axis: trim_mean(runs, 0.25, axis=axis),
+        axis=0,
+        n_resamples=RESAMPLES,
+        batch=100,
+        method="percentile",
+        rng=np.random.default_rng(_BOOTSTRAP_SEED),
+    )
+    return Estimate(mean, *resampled.confidence_interval)
+
+
+def _checked(values: np.ndarray, ndim: int) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    if values.ndim != ndim or values.size == 0 or not np.isfinite(values).all():
+        raise ValueError(f"values must be {ndim}-dimensional, finite and not empty, got {values}")
+    return values
+
+
+def _estimate(scores: Any, statistic: Callable[..., np.ndarray], resamples: int) -> Estimate:
+    with warnings.catch_warnings():
+        # rliable hands its random state to arch by an argument that arch has renamed.
+        warnings.filterwarnings("ignore", "random_state is deprecated", FutureWarning)
+        points, intervals = library.get_interval_estimates(
+            {"scores": scores},
+            statistic,
+            reps=resamples,
+            random_state=np.random.RandomState(_BOOTSTRAP_SEED),
+        )
+    low, high = intervals["scores"][:, 0]
+    return Estimate(points["scores"][0], low, high)
 
 
 def probability_of_improvement(better: np.ndarray, worse: np.ndarray) -> Estimate:
@@ -76,15 +126,16 @@ def probability_of_improvement(better: np.ndarray, worse: np.ndarray) -> Estimat
         >>> float(probability_of_improvement(np.arange(3.0), np.arange(3.0)).value)
         0.5
     """
-    scores = {"pair": [np.asarray(v, np.float64)[:, None] for v in (better, worse)]}
-    points, intervals = library.get_interval_estimates(
-        scores,
+    return _improvement(tuple(np.asarray(better).tolist()), tuple(np.asarray(worse).tolist()))
+
+
+@functools.cache
+def _improvement(better: tuple[float, ...], worse: tuple[float, ...]) -> Estimate:
+    return _estimate(
+        [np.array(better)[:, None], np.array(worse)[:, None]],
         lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-        reps=RESAMPLES // 4,
-        random_state=np.random.RandomState(_BOOTSTRAP_SEED),
+        RESAMPLES // 4,
     )
-    low, high = intervals["pair"][:, 0]
-    return Estimate(points["pair"][0], low, high)
 
 
 def common_grid(steps: Sequence[np.ndarray]) -> np.ndarray:

@@ -1,0 +1,93 @@
+"""Policies drawn in their tunnel, from recorded samples (thesis figures 3.2, 3.4, 3.6, 3.8)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.diagnostics.figures import POLICY_BLUE, new_figure
+from sb3_flowpolicy.experiments.evidence import Evidence
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_WALL, _GOAL = "#d62728", "#78c878"
+
+
+def policies_figure(evidence: Evidence) -> Figure | None:
+    """Draw each agent's action samples at several states of one test episode.
+
+    A row per setting, agent and moment of training, a column per state.
+
+    Args:
+        evidence: Results, complete or not.
+
+    Returns:
+        A matplotlib figure, None where no policies were recorded.
+    """
+    rows = [
+        (setting, agent, picture)
+        for setting in evidence.experiment.settings
+        for agent in evidence.experiment.agents
+        for picture in evidence.pictures(setting.name, agent.name)
+    ]
+    if not rows:
+        return None
+    columns = max(len(picture["steps"]) for _, _, picture in rows)
+    figure = new_figure(2.1 * columns + 0.5, 2.15 * len(rows))
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    several = len(evidence.experiment.settings) > 1
+    for line, (setting, agent, picture) in zip(grid, rows, strict=True):
+        env = gym.make(setting.env_id, **setting.env_kwargs).unwrapped
+        for axes in line:
+            axes.set_axis_off()
+        for k, axes in zip(range(len(picture["steps"])), line, strict=False):
+            _draw_tunnel(axes, env)
+            _draw_policy(axes, env, picture, k)
+        where = f"{setting.name}, " if several else ""
+        line[0].set_axis_on()
+        line[0].set(xticks=[], yticks=[])
+        line[0].spines[:].set_visible(False)
+        line[0].set_ylabel(
+            f"{where}{agent.label}\nseed {picture['seed']}, {picture['step'] / 1000:g}k steps",
+            fontsize=7,
+        )
+    return figure
+
+
+def _draw_tunnel(axes: Axes, env: Any) -> None:
+    config = env.config
+    path = config.geometry
+    low, high = path.ends
+    centre = path.polyline(low, high)
+    along = np.gradient(centre, axis=0)
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    across *= config.width / 2 / np.linalg.norm(across, axis=1, keepdims=True)
+    goal = path.polyline(*path.goal_arcs)
+    axes.plot(*goal.T, color=_GOAL, linewidth=5, solid_capstyle="butt")
+    for side in (-1, 1):
+        axes.plot(*(centre + side * across).T, color=_WALL, linewidth=0.7)
+    axes.set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
+
+
+def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:
+    position = np.array(picture["positions"][k])
+    trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
+    reach = env.config.reach
+    ends = position + reach * np.array(picture["samples"][k])
+    axes.scatter(*trail.T, s=4, color="#969696", linewidths=0)
+    axes.add_patch(_box(position, reach))
+    axes.scatter(*ends.T, s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
+    axes.scatter(*position, s=10, color="black", zorder=3)
+    axes.set_title(f"step {picture['steps'][k]}", fontsize=7)
+
+
+def _box(position: np.ndarray, reach: float) -> Any:
+    from matplotlib.patches import Rectangle
+
+    corner = (float(position[0] - reach), float(position[1] - reach))
+    return Rectangle(corner, 2 * reach, 2 * reach, fill=False, edgecolor="#aaaaaa", linewidth=0.7)
