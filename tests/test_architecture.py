@@ -26,6 +26,7 @@ FLOORS = [
     "benchmarks",
     "diagnostics",
     "zoo",
+    "experiments",
 ]
 THIRD_PARTY = {
     "distributions": {"torch"},

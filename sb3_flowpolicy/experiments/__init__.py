@@ -1,1 +1,1 @@
-"""Chapter 3 of the thesis as experiments: `python -m sb3_flowpolicy.experiments list|run|report`."""
+"""Chapter 3 of the thesis: `python -m sb3_flowpolicy.experiments list|run|report`."""

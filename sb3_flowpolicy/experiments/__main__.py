@@ -46,7 +46,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _list(args: argparse.Namespace) -> None:
-    print(f"{'experiment':<22}{'claim':<7}{'agents':>6}{'settings':>9}{'steps':>11}{'seeds':>6}", end="")
+    print(
+        f"{'experiment':<22}{'claim':<7}{'agents':>6}{'settings':>9}{'steps':>11}{'seeds':>6}",
+        end="",
+    )
     print(f"{'time':>10}  here?  what it compares")
     for experiment in EXPERIMENTS.values():
         missing = what_is_missing(experiment)

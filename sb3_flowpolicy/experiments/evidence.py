@@ -165,9 +165,7 @@ class Evidence:
 
     def profile(self, setting: str, agent: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return shares of the way (K,) and the entropy there (S, K) at the end of training."""
-        found = [
-            one for one in self._details.get((setting, agent), []) if one["kind"] == "profile"
-        ]
+        found = [one for one in self._details.get((setting, agent), []) if one["kind"] == "profile"]
         if not found:
             return None
         return np.array(found[0]["way"]), np.array([one["entropy"] for one in found])

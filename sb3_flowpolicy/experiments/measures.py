@@ -86,7 +86,9 @@ class TestEpisodes:
         self.n_models, self.n_episodes = n_models, n_episodes
         self.venv: VectorEnv = make_vec_env(env, n_models * n_episodes)
 
-    def run(self, models: list[SACFlow], seeds: tuple[int, ...]) -> list[tuple[float, float | None]]:
+    def run(
+        self, models: list[SACFlow], seeds: tuple[int, ...]
+    ) -> list[tuple[float, float | None]]:
         """Return mean return and success rate of each policy.
 
         Episodes start from the same seeds at every call, far from those of training. The success
@@ -115,7 +117,10 @@ class TestEpisodes:
     def _act(self, models: list[SACFlow], obs: np.ndarray) -> np.ndarray:
         parts = np.split(obs, self.n_models)
         return np.concatenate(
-            [model.predict(part, deterministic=True)[0] for model, part in zip(models, parts, strict=True)]
+            [
+                model.predict(part, deterministic=True)[0]
+                for model, part in zip(models, parts, strict=True)
+            ]
         )
 
     def close(self) -> None:
@@ -138,7 +143,9 @@ def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[fl
     arcs = way * config.geometry.goal_arcs[0]
     points = np.stack([config.geometry.point(arc) for arc in arcs])
     if config.path == "circle":
-        radii = np.column_stack([np.full(len(points), config.radius), np.linalg.norm(points, axis=1)])
+        radii = np.column_stack(
+            [np.full(len(points), config.radius), np.linalg.norm(points, axis=1)]
+        )
         points = np.concatenate([points, radii], axis=1)
     with own_random_numbers(seed, model.num_timesteps, 3):
         entropy = actor_of(model).entropy(th.as_tensor(points.astype(np.float32)), PROFILE_SAMPLES)

@@ -105,7 +105,8 @@ def at_least_times(setting: str, metric: str, more: Agent, less: Agent, factor: 
 
     def test(evidence: Evidence) -> Finding:
         a, b = (
-            interquartile_mean(evidence.final(setting, agent.name, metric)) for agent in (more, less)
+            interquartile_mean(evidence.final(setting, agent.name, metric))
+            for agent in (more, less)
         )
         holds = float(a.value) >= factor * float(b.value)
         ratio = f", {float(a.value) / float(b.value):.2f} times" if b.value > 0 else ""

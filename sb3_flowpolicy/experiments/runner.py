@@ -20,7 +20,7 @@ from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
 from sb3_flowpolicy.experiments.work import Plan, WorkItem
 
 # Read by OpenMP and numba when a process starts: one thread each, as many processes as cores.
-_ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _reports: Any = None
 
 
@@ -107,8 +107,8 @@ def _pass_on(reports: Any, progress: Progress) -> None:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:

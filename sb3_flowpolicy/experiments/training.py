@@ -21,7 +21,7 @@ from sb3_flowpolicy.experiments.measures import (
 )
 from sb3_flowpolicy.experiments.store import ItemFiles, Row, read_json, write_json
 from sb3_flowpolicy.experiments.work import WorkItem, environment
-from sb3_flowpolicy.sac_flow import UPDATES_WORTH_COMPILING
+from sb3_flowpolicy.sac_flow import UPDATES_WORTH_COMPILING, SACFlow
 from sb3_flowpolicy.seed_batch import SeedBatch
 
 Report = Callable[[str, int], None]
@@ -84,7 +84,8 @@ class _Training:
             for at in item.pictures_at:
                 if before < at <= self.done_steps:
                     self._record("picture", policy_picture, self.batch.seeds[:1])
-            if self.done_steps // item.checkpoint_every > before // item.checkpoint_every:
+            crossed = self.done_steps // item.checkpoint_every > before // item.checkpoint_every
+            if crossed and self.done_steps < item.steps:
                 self._save()
             self.report(item.key, self.done_steps)
         if "profile" in item.measures:
@@ -190,7 +191,8 @@ def _mean(values: list[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def _ent_coef(model) -> float:  # noqa: ANN001
+def _ent_coef(model: SACFlow) -> float:
     if model.ent_coef_optimizer is None:
-        return float(model.ent_coef_tensor)
+        return model.ent_coef_tensor.item()
+    assert model.log_ent_coef is not None
     return model.log_ent_coef.detach().exp().item()

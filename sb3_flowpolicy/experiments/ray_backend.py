@@ -1,0 +1,122 @@
+"""Doing work items on a Ray cluster: the same items, on as many machines as there are.
+
+Each item is a task with one core. It works in a temporary folder of its machine and returns its
+files, which are written into the results here. A task whose machine is lost starts anew on
+another; nothing of an item arrives here before all of it has.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_flowpolicy.experiments.progress import Progress
+from sb3_flowpolicy.experiments.runner import ONE_THREAD
+from sb3_flowpolicy.experiments.store import ItemFiles
+from sb3_flowpolicy.experiments.work import WorkItem
+
+MOST_RETRIES = 10
+"""Losing a machine is nobody's fault, but an item that brings every machine down must end."""
+_POLL_SECONDS = 0.5
+
+
+def run_on_ray(
+    folder: Path, items: Sequence[WorkItem], progress: Progress, address: str | None = None
+) -> None:
+    """Do items as Ray tasks.
+
+    Args:
+        folder: Folder of the experiment, claimed; only this machine needs to see it.
+        items: What to do.
+        progress: Shows how far they are.
+        address: Cluster to join; Default: the one that this process is connected to, that of the
+            variable ``RAY_ADDRESS``, or a new one on this machine alone.
+
+    Raises:
+        ModuleNotFoundError: If Ray is missing.
+        ValueError: If an item's files are damaged.
+        RuntimeError: If an item could not be done.
+        OSError: If a file cannot be written here.
+    """
+    try:
+        import ray
+        from ray.exceptions import RayError, RayTaskError
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            '--backend ray needs Ray: pip install "sb3_flowpolicy[distributed]"'
+        ) from error
+
+    if not ray.is_initialized():
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level="warning")
+        except ConnectionError as error:
+            raise RuntimeError(f"no Ray cluster answers at {address!r}: {error}") from error
+    environment = {"env_vars": dict.fromkeys(ONE_THREAD, "1")}
+    board = ray.remote(_Board).options(num_cpus=0, runtime_env=environment).remote()
+    task = ray.remote(_run_away).options(
+        num_cpus=1, max_retries=MOST_RETRIES, runtime_env=environment
+    )
+    waiting = {task.remote(item, board): item for item in items}
+    try:
+        while waiting:
+            done, _ = ray.wait(list(waiting), timeout=_POLL_SECONDS)
+            for key, steps in ray.get(board.take.remote()).items():
+                progress.update(key, steps)
+            for reference in done:
+                item = waiting.pop(reference)
+                _collect(ItemFiles(folder, item.key), ray.get(reference))
+                progress.update(item.key, item.steps)
+    except RayTaskError as error:
+        cause = error.cause
+        if isinstance(cause, OSError | ValueError):
+            raise type(cause)(f"on another machine: {cause}") from error
+        raise RuntimeError(f"an item failed on another machine: {error}") from error
+    except RayError as error:
+        raise RuntimeError(
+            f"the cluster gave up on an item after {MOST_RETRIES} retries; finished items are "
+            f"kept: {error}"
+        ) from error
+    finally:
+        for reference in waiting:
+            ray.cancel(reference, force=True)
+        ray.kill(board)
+
+
+class _Board:
+    """Where tasks post how far they are; lives beside the runner."""
+
+    def __init__(self) -> None:
+        self.steps: dict[str, int] = {}
+
+    def post(self, key: str, steps: int) -> None:
+        self.steps[key] = steps
+
+    def take(self) -> dict[str, int]:
+        steps, self.steps = self.steps, {}
+        return steps
+
+
+def _run_away(item: WorkItem, board: object) -> dict[str, bytes]:
+    """Do an item on whatever machine this is, and return its files."""
+    from sb3_flowpolicy.experiments.training import run_item
+
+    folder = Path(tempfile.mkdtemp(prefix="sb3_flowpolicy_"))
+    try:
+        run_item(item, folder, lambda key, steps: board.post.remote(key, steps))  # type: ignore[attr-defined]
+        return {path.name: path.read_bytes() for path in _paths(ItemFiles(folder, item.key))}
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _paths(files: ItemFiles) -> list[Path]:
+    """Return the files of a finished item; what declares it finished comes last."""
+    return [path for path in (files.table, files.details, files.done) if path.exists()]
+
+
+def _collect(files: ItemFiles, content: dict[str, bytes]) -> None:
+    for name, data in content.items():
+        partial = files.folder / f".{name}.partial"
+        partial.write_bytes(data)
+        partial.replace(files.folder / name)
