@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def colour(agent: Agent) -> str:
 
 
 def panels(evidence: Evidence) -> list[str]:
-    """Return the metrics that are worth a panel: those measured, α only where it is learned."""
+    """Return the metrics that are worth a panel: those measured, temperature if learned."""
     measured: set[str] = set()
     moves = False
     for setting in evidence.experiment.settings:
@@ -114,7 +114,7 @@ def _dress(axes: Axes, metric: str) -> None:
 
 
 def _legend(grid: np.ndarray) -> tuple[list, list]:
-    found = {}
+    found: dict[str, Any] = {}
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)

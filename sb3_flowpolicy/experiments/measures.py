@@ -73,7 +73,7 @@ MEASURES: dict[str, Callable[[SACFlow, int], float]] = {
 """Further columns of a table; an experiment names those it wants."""
 
 
-class TestEpisodes:
+class DeterministicEpisodes:
     """Deterministic episodes of several policies, all stepped at once.
 
     Args:
@@ -143,10 +143,8 @@ def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[fl
     arcs = way * config.geometry.goal_arcs[0]
     points = np.stack([config.geometry.point(arc) for arc in arcs])
     if config.path == "circle":
-        radii = np.column_stack(
-            [np.full(len(points), config.radius), np.linalg.norm(points, axis=1)]
-        )
-        points = np.concatenate([points, radii], axis=1)
+        radius = np.full(len(points), config.radius)
+        points = np.column_stack([points, radius, np.linalg.norm(points, axis=1)])
     with own_random_numbers(seed, model.num_timesteps, 3):
         entropy = actor_of(model).entropy(th.as_tensor(points.astype(np.float32)), PROFILE_SAMPLES)
     return {"way": _rounded(way), "entropy": _rounded(entropy.numpy())}

@@ -79,10 +79,10 @@ def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:
     trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
     reach = env.config.reach
     ends = position + reach * np.array(picture["samples"][k])
-    axes.scatter(*trail.T, s=4, color="#969696", linewidths=0)
+    axes.scatter(trail[:, 0], trail[:, 1], s=4, color="#969696", linewidths=0)
     axes.add_patch(_box(position, reach))
-    axes.scatter(*ends.T, s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
-    axes.scatter(*position, s=10, color="black", zorder=3)
+    axes.scatter(ends[:, 0], ends[:, 1], s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
+    axes.scatter(position[0], position[1], s=10, color="black", zorder=3)
     axes.set_title(f"step {picture['steps'][k]}", fontsize=7)
 
 

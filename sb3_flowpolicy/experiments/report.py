@@ -39,7 +39,7 @@ METHOD = (
     f"solved'. Oscillations are counted as swings of at least "
     f"{definitions.OSCILLATIONS['train_return']:g} in training return, "
     f"{definitions.OSCILLATIONS['entropy']:g} nats in entropy and "
-    f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of α, from the first training "
+    f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the temperature, from the first training "
     "success on; the curve with the fewest decides. Logs of unequal length are interpolated to a "
     "common grid that ends with the shortest. "
     f"Curves are drawn as means over {SMOOTHED_OVER} measurements. A claim is reproduced if all "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -16,7 +17,7 @@ WORDS = {
     "test_return": "test return",
     "test_success": "test success",
     "entropy": "entropy",
-    "ent_coef": "temperature α",
+    "ent_coef": "temperature",
     "same_axis_correlation": "correlation of same-axis actions",
 }
 """How metrics are called in sentences."""
@@ -66,12 +67,10 @@ def ordered(setting: str, metric: str, agents: Sequence[Agent], margin: float = 
         finals = [evidence.final(setting, agent.name, metric) for agent in agents]
         means = [interquartile_mean(final) for final in finals]
         chances = [
-            probability_of_improvement(more, less)
-            for more, less in zip(finals, finals[1:], strict=False)
+            probability_of_improvement(more, less) for more, less in itertools.pairwise(finals)
         ]
         falls = all(
-            float(more.value - less.value) > margin
-            for more, less in zip(means, means[1:], strict=False)
+            float(more.value - less.value) > margin for more, less in itertools.pairwise(means)
         )
         return Finding(
             falls,
@@ -139,7 +138,7 @@ def oscillates(setting: str, agent: Agent, share: float) -> Check:
     """Demand that at least this share of the seeds oscillates."""
     return Check(
         f"{setting}: {agent.label} oscillates (at least {SWINGS_OF_AN_OSCILLATION} swings in "
-        f"return, entropy and α) in at least {share:.0%} of the seeds",
+        f"return, entropy and temperature) in at least {share:.0%} of the seeds",
         _swinging(setting, agent, lambda flags: flags.mean() >= share - 1e-9),
     )
 

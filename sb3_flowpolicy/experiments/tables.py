@@ -53,14 +53,14 @@ def results_table(evidence: Evidence) -> Table:
                 final = interquartile_mean(evidence.final(setting.name, agent.name, name))
                 row.append(f"{final:.4f}" if name == "ent_coef" else f"{final:.2f}")
             else:
-                row.append("–")
+                row.append("-")
         rows.append(row)
     return Table(head, rows)
 
 
 def _counts(evidence: Evidence, setting: str, agent: str) -> list[str]:
     if "test_success" not in evidence.columns(setting, agent):
-        return ["–"] * 3
+        return ["-"] * 3
     solved, once = evidence.solved(setting, agent), evidence.solved_once(setting, agent)
     steps = interquartile_mean(evidence.steps_until_solved(setting, agent))
     return [

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from sb3_flowpolicy.benchmarks.report import machine
 from sb3_flowpolicy.experiments.measures import (
     MEASURES,
-    TestEpisodes,
+    DeterministicEpisodes,
     entropy_profile,
     policy_entropy,
     policy_picture,
@@ -69,7 +69,7 @@ class _Training:
         self.seconds_before, self.sessions = 0.0, 1
         self.done_steps = 0
         self.batch = self._resume() or self._begin()
-        self.tests = TestEpisodes(self.env, len(item.seeds), item.test_episodes)
+        self.tests = DeterministicEpisodes(self.env, len(item.seeds), item.test_episodes)
 
     def run(self) -> None:
         item = self.item
