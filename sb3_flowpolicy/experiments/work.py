@@ -16,7 +16,7 @@ from sb3_flowpolicy.hyperparameters import load_hyperparameters
 FIRST_SEED = 1
 SEEDS_PER_ITEM = 10
 QUICK_STEPS, QUICK_SEEDS = 3000, 2
-EVALUATIONS_PER_CHECKPOINT = 10
+CHECKPOINTS = 6
 # Raised whenever the files of a run change their meaning.
 SCHEMA = 1
 
@@ -152,7 +152,7 @@ def _item(
         hyperparameters=hyperparameters,
         steps=steps,
         eval_every=eval_every,
-        checkpoint_every=eval_every * EVALUATIONS_PER_CHECKPOINT,
+        checkpoint_every=eval_every * max(1, round(steps / eval_every / CHECKPOINTS)),
         test_episodes=experiment.test_episodes,
         measures=experiment.measures,
         pictures_at=tuple(round(share * steps) for share in experiment.pictures_at),

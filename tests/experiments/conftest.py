@@ -1,0 +1,109 @@
+"""A tiny experiment that trains in a second, and made-up results that need no training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_flowpolicy.experiments.experiment import FLOW, GAUSS, Experiment, Setting
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
+from sb3_flowpolicy.experiments.rules import mostly_fails, none_fails
+from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
+from sb3_flowpolicy.experiments.work import Plan, make_plan
+
+FAST = {
+    "learning_starts": 30,
+    "random_steps": 30,
+    "buffer_size": 500,
+    "batch_size": 16,
+    "ent_coef": "auto",
+    "policy_kwargs": {"net_arch": [8, 8]},
+}
+TINY = Experiment(
+    name="tiny",
+    claim="T1",
+    source="a test",
+    title="A tiny circle",
+    thesis="NF solves it, Gauss does not.",
+    settings=(Setting("circle", "TunnelCircle-v0", overrides=FAST),),
+    agents=(GAUSS, FLOW),
+    checks=(none_fails("circle", FLOW), mostly_fails("circle", GAUSS, 0.3)),
+    steps=120,
+    seeds=2,
+    eval_every=20,
+    measures=("profile",),
+    pictures_at=(0.5, 1.0),
+)
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> Experiment:
+    """The tiny experiment, known by its name."""
+    monkeypatch.setitem(EXPERIMENTS, TINY.name, TINY)
+    return TINY
+
+
+MakeUp = Callable[..., Plan]
+
+
+@pytest.fixture
+def make_up(tmp_path: Path) -> MakeUp:
+    """Write finished results of an experiment whose numbers are known."""
+
+    def write(name: str, levels: dict[str, float] | None = None, seeds: int = 10) -> Plan:
+        plan = make_plan(find(name), seeds=seeds)
+        folder = tmp_path / name
+        claim_folder(folder, plan.settings())
+        for item in plan.items:
+            level = (levels or {"gauss": 0.0}).get(item.agent, 1.0)
+            _write_item(ItemFiles(folder, item.key), item, level)
+        return plan
+
+    return write
+
+
+def _write_item(files: ItemFiles, item, level: float) -> None:
+    steps = range(item.eval_every, item.steps + 1, item.eval_every)
+    for seed in item.seeds:
+        rng = np.random.default_rng(seed)
+        rows = []
+        for step in steps:
+            done = level * min(1.0, 2.0 * step / item.steps)
+            rows.append(
+                {
+                    "seed": seed,
+                    "step": step,
+                    "episodes": 50,
+                    "train_return": done + 0.01 * rng.normal(),
+                    "train_success": done,
+                    "test_return": done + 0.01 * rng.normal(),
+                    "test_success": float(done >= 1.0),
+                    "entropy": -3.0 + level + 0.05 * rng.normal(),
+                    "ent_coef": 0.01
+                    if item.hyperparameters.get("ent_coef") != "auto"
+                    else 1 / step,
+                }
+            )
+        files.append_rows(rows)
+        way = [k / 12 for k in range(12)]
+        entropy = [level * (k - 6) for k in range(12)]
+        if "profile" in item.measures:
+            files.append_detail({"kind": "profile", "seed": seed, "way": way, "entropy": entropy})
+    if item.pictures_at:
+        samples = np.random.default_rng(0).uniform(-1, 1, (2, 20, 2)).tolist()
+        picture = {"steps": [0, 1], "positions": [[0.7, 0.0], [0.7, 0.1]], "samples": samples}
+        trail = [[0.7, 0.0], [0.7, 0.1], [0.6, 0.2]]
+        head = {"kind": "picture", "seed": item.seeds[0], "step": item.steps}
+        files.append_detail({**head, **picture, "trail": trail})
+    versions = {"torch": "2", "stable_baselines3": "2", "gymnasium": "1"}
+    machine = {
+        "commit": "abc",
+        "cpu_count": 2,
+        "processor": "p",
+        "python": "3",
+        "versions": versions,
+    }
+    files.finish({"seconds": 60.0, "steps_per_second": 100.0, "machine": machine})

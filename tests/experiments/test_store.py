@@ -1,0 +1,98 @@
+"""Files of results: nothing lost, nothing mixed, nothing corrupt read as if it were sound."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, claim_folder, write_json
+
+ROW = dict.fromkeys(BASIC_COLUMNS, 0.25) | {"seed": 1, "step": 100, "train_success": None}
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> ItemFiles:
+    found = ItemFiles(tmp_path, "circle-flow")
+    found.append_rows([ROW, {**ROW, "seed": 2}])
+    found.append_rows([{**ROW, "step": 200}])
+    return found
+
+
+def test_rows_come_back(files: ItemFiles) -> None:
+    rows = files.read_rows()
+    assert [(row["seed"], row["step"]) for row in rows] == [(1, 100), (2, 100), (1, 200)]
+    assert rows[0]["train_success"] is None
+    assert rows[0]["entropy"] == 0.25
+
+
+@pytest.mark.parametrize(
+    "line", ["1,300,oops,0,0,0,0,0,0\n", "1,300,0\n", "1,300,0,0,0,0,0,nan,0\n", "\n", "\0\0\0\n"]
+)
+def test_a_corrupt_line_is_named(files: ItemFiles, line: str) -> None:
+    with open(files.table, "a") as file:
+        file.write(line)
+    files.append_rows([{**ROW, "step": 400}])
+    with pytest.raises(ValueError, match=r"circle-flow\.csv, line 5 must hold 9 finite numbers"):
+        files.read_rows()
+
+
+def test_a_corrupt_detail_is_named(files: ItemFiles) -> None:
+    files.append_detail({"kind": "profile"})
+    with open(files.details, "a") as file:
+        file.write("{oops\n")
+    with pytest.raises(ValueError, match=r"details\.jsonl, line 2 must be JSON"):
+        files.read_details()
+
+
+def test_half_a_line_is_not_read_and_goes_when_the_run_goes_on(files: ItemFiles) -> None:
+    whole, lengths = files.table.read_bytes(), files.lengths()
+    with open(files.table, "a") as file:
+        file.write("1,300,0.1")
+    assert len(files.read_rows()) == 3
+    files.cut_to(lengths)
+    assert files.table.read_bytes() == whole
+    with open(files.table, "a") as file:
+        file.write("1,300,0.1")
+    files.finish({})
+    with pytest.raises(ValueError, match="line 5 must hold 9 finite numbers"):
+        files.read_rows()
+
+
+def test_lines_that_vanished_are_noticed(files: ItemFiles) -> None:
+    lengths = files.lengths()
+    files.table.write_text("")
+    with pytest.raises(ValueError, match=r"circle-flow\.csv must hold the \d+ bytes"):
+        files.cut_to(lengths)
+
+
+def test_nothing_infinite_is_written(files: ItemFiles) -> None:
+    before = files.table.read_bytes()
+    with pytest.raises(ValueError, match="must be finite, got nan"):
+        files.append_rows([{**ROW, "entropy": float("nan")}])
+    assert files.table.read_bytes() == before
+
+
+def test_a_folder_keeps_to_its_settings(tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 2)}}})
+    claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 2)}}})
+    with pytest.raises(ValueError, match=r"items\.a\.seeds: there \[1, 2\], now \[1, 3\]"):
+        claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 3)}}})
+
+
+def test_a_folder_of_unknown_origin_is_refused(tmp_path: Path, files: ItemFiles) -> None:
+    with pytest.raises(ValueError, match=r"must be new or have its settings\.json"):
+        claim_folder(tmp_path, {"steps": 100})
+    (tmp_path / "settings.json").write_text("{")
+    with pytest.raises(ValueError, match=r"settings\.json must be JSON, got an error in line 1"):
+        claim_folder(tmp_path, {"steps": 100})
+
+
+def test_a_file_is_written_at_once_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "done.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        write_json(path, {"a": object()})
+    assert '"a": 1' in path.read_text()
+    assert [one.name for one in tmp_path.iterdir()] == ["done.json"]
