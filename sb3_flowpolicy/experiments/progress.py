@@ -29,16 +29,12 @@ class Progress:
         self.bars: dict[str, tqdm] = {}
         self.lines: dict[str, int] = {}
         count = sum(item.steps * len(item.seeds) for item in items)
-        self.total = self._bar("all", count, 0)
-        for key in finished:
-            # What was done earlier must not make the rest look quicker than it is.
-            self.total.initial += self._weight(key)
-        self.total.n = self.total.initial
-        self.total.refresh()
+        self.total = self._bar("all", count, 0, sum(self._weight(key) for key in finished))
 
-    def _bar(self, name: str, total: int, position: int) -> tqdm:
+    def _bar(self, name: str, total: int, position: int, initial: int = 0) -> tqdm:
         return tqdm(
             total=total,
+            initial=initial,
             desc=name,
             unit=" steps",
             unit_scale=True,
@@ -64,7 +60,7 @@ class Progress:
                 item = self.items[key]
                 self.bars[key] = self._bar(key, item.steps * len(item.seeds), self.lines[key])
             # Steps of an earlier session say nothing about the speed of this one.
-            if gained:
+            if self.shown:
                 self.total.initial += gained
         self.total.update(gained)
         bar = self.bars.get(key)

@@ -40,8 +40,8 @@ METHOD = (
     f"{definitions.OSCILLATIONS['train_return']:g} in training return, "
     f"{definitions.OSCILLATIONS['entropy']:g} nats in entropy and "
     f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the temperature, from the "
-    "first training success on; the curve with the fewest decides. Logs of unequal length are interpolated to a "
-    "common grid that ends with the shortest. "
+    "first training success on; the curve with the fewest decides. Logs of unequal length are "
+    "interpolated to a common grid that ends with the shortest. "
     f"Curves are drawn as means over {SMOOTHED_OVER} measurements. A claim is reproduced if all "
     "lines of its rule hold, not reproduced if none does, partly reproduced otherwise."
 )

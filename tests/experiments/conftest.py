@@ -54,11 +54,12 @@ def make_up(tmp_path: Path) -> MakeUp:
     """Write finished results of an experiment whose numbers are known."""
 
     def write(name: str, levels: dict[str, float] | None = None, seeds: int = 10) -> Plan:
+        chosen = levels or {"gauss": 0.0}
         plan = make_plan(find(name), seeds=seeds)
         folder = tmp_path / name
         claim_folder(folder, plan.settings())
         for item in plan.items:
-            level = (levels or {"gauss": 0.0}).get(item.agent, 1.0)
+            level = chosen.get(item.key, chosen.get(item.agent, 1.0))
             _write_item(ItemFiles(folder, item.key), item, level)
         return plan
 
@@ -67,6 +68,7 @@ def make_up(tmp_path: Path) -> MakeUp:
 
 def _write_item(files: ItemFiles, item, level: float) -> None:
     steps = range(item.eval_every, item.steps + 1, item.eval_every)
+    learned = item.hyperparameters.get("ent_coef") == "auto"
     for seed in item.seeds:
         rng = np.random.default_rng(seed)
         rows = []
@@ -82,9 +84,7 @@ def _write_item(files: ItemFiles, item, level: float) -> None:
                     "test_return": done + 0.01 * rng.normal(),
                     "test_success": float(done >= 1.0),
                     "entropy": -3.0 + level + 0.05 * rng.normal(),
-                    "ent_coef": 0.01
-                    if item.hyperparameters.get("ent_coef") != "auto"
-                    else 1 / step,
+                    "ent_coef": 1 / step if learned else 0.01,
                 }
             )
         files.append_rows(rows)

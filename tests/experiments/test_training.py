@@ -69,11 +69,10 @@ def test_interrupted_runs_end_with_the_same_results(
     crashes: list[int], item: WorkItem, tmp_path: Path
 ) -> None:
     """A crash after so many reports of a session; half a line is left behind."""
-    run_item(item, tmp_path / "straight", quiet) if (
-        tmp_path / "straight"
-    ).mkdir() is None else None
-    folder = tmp_path / "interrupted"
+    straight, folder = tmp_path / "straight", tmp_path / "interrupted"
+    straight.mkdir()
     folder.mkdir()
+    run_item(item, straight, quiet)
     files = ItemFiles(folder, item.key)
     for count in crashes:
         reports = []
@@ -89,7 +88,7 @@ def test_interrupted_runs_end_with_the_same_results(
             run_item(item, folder, crash)
         assert not files.finished
     run_item(item, folder, quiet)
-    assert contents(folder) == contents(tmp_path / "straight")
+    assert contents(folder) == contents(straight)
     done = files.read_done()
     assert done is not None
     assert done["steps"] == 120

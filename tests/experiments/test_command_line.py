@@ -1,0 +1,152 @@
+"""`python -m sb3_flowpolicy.experiments`: what a user types, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+
+from sb3_flowpolicy.experiments.__main__ import main
+from sb3_flowpolicy.experiments.experiment import Experiment
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
+
+
+def test_list_shows_every_experiment(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name in EXPERIMENTS:
+        assert any(line.startswith(f"{name} ") for line in lines)
+
+
+def test_a_run_leaves_results_and_is_not_repeated(
+    tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", "tiny", "--out", str(tmp_path), "--workers", "2"]
+    assert main(command) == 0
+    captured = capsys.readouterr()
+    assert "2 items of 120 steps x 2 seeds, 0 finished before" in captured.out
+    assert "all: 100%" in captured.err
+    folder = tmp_path / "tiny"
+    tables = {path.name: path.read_bytes() for path in folder.glob("*.csv")}
+    assert set(tables) == {"circle-gauss.csv", "circle-flow.csv"}
+    stamps = [path.stat().st_mtime_ns for path in sorted(folder.glob("*.csv"))]
+    assert main([*command, "--no-progress"]) == 0
+    captured = capsys.readouterr()
+    assert "2 finished before" in captured.out
+    assert "%" not in captured.err
+    assert [path.stat().st_mtime_ns for path in sorted(folder.glob("*.csv"))] == stamps
+
+    # The same folder takes no results of other settings, and is left as it was.
+    assert main([*command, "--steps", "90"]) == 1
+    error = capsys.readouterr().err
+    assert "must hold results of the same settings" in error
+    assert "steps: there 120, now 90" in error
+    assert {path.name: path.read_bytes() for path in folder.glob("*.csv")} == tables
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sparse-fixed-alfa"], "did you mean 'sparse-fixed-alpha'"),
+        (["tiny", "--seeds", "0"], "seeds must be at least 1, got 0"),
+        (["tiny", "--steps", "-5"], "steps must be at least 1, got -5"),
+        (["tiny", "--seeds-per-item", "0"], "seeds_per_item must be at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments_are_errors_that_help(
+    arguments: list[str],
+    message: str,
+    tiny: Experiment,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["run", *arguments, "--out", str(tmp_path)]) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written(
+    tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["run", "tiny", "--out", str(tmp_path / "file")]) == 1
+    error = capsys.readouterr().err
+    assert "Not a directory" in error
+    assert "the same command goes on" in error
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+def test_a_full_disk_ends_the_run_with_one_sentence(
+    tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tiny").mkdir()
+    command = ["run", "tiny", "--out", str(tmp_path), "--workers", "1", "--no-progress"]
+    (tmp_path / "tiny" / "circle-gauss.details.jsonl").symlink_to("/dev/full")
+    assert main(command) == 1
+    error = capsys.readouterr().err
+    assert "No space left on device" in error
+    assert "What is finished is kept" in error
+
+
+def test_two_runs_do_not_share_a_folder(
+    tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tiny").mkdir()
+    with FileLock(tmp_path / "tiny" / ".run.lock"):
+        assert main(["run", "tiny", "--out", str(tmp_path)]) == 1
+    assert "must be used by one run at a time" in capsys.readouterr().err
+
+
+def test_a_report_of_nothing_says_how_to_make_something(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", "--results", str(tmp_path)]) == 1
+    assert "experiments run NAME makes some" in capsys.readouterr().err
+
+
+def _command(out: Path) -> list[str]:
+    module = [sys.executable, "-m", "sb3_flowpolicy.experiments", "run", "sparse-fixed-alpha"]
+    options = ["--steps", "1500", "--seeds", "2", "--workers", "2", "--no-progress"]
+    return [*module, *options, "--out", str(out)]
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments_it_ends_with_the_same_results(tmp_path: Path) -> None:
+    """SIGKILL for the runner alone: its processes have to notice by themselves."""
+    straight, killed = tmp_path / "straight", tmp_path / "killed"
+    start = time.monotonic()
+    subprocess.run(_command(straight), check=True, capture_output=True)
+    duration = time.monotonic() - start
+    rng = random.Random(0)
+    kills = 0
+    for _ in range(5):
+        process = subprocess.Popen(
+            _command(killed), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            process.wait(rng.uniform(0.25, 0.5) * duration)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            kills += 1
+        process.wait()
+    assert kills >= 3
+    subprocess.run(_command(killed), check=True, capture_output=True)
+
+    def results(out: Path) -> dict[str, bytes]:
+        folder = out / "sparse-fixed-alpha"
+        wanted = (".csv", ".jsonl")
+        return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix in wanted}
+
+    assert len(results(straight)) == 12
+    assert results(killed) == results(straight)
+    done = [json.loads(path.read_text()) for path in killed.rglob("*.done.json")]
+    assert len(done) == 6
+    assert sum(one["sessions"] for one in done) > 6

@@ -1,0 +1,80 @@
+"""The manifest: every claim is there, and what it says can be run."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_flowpolicy.experiments.costs import in_words, item_seconds, plan_seconds
+from sb3_flowpolicy.experiments.experiment import Experiment
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
+from sb3_flowpolicy.experiments.work import environment, make_plan
+from sb3_flowpolicy.hyperparameters import load_hyperparameters
+
+
+def test_all_claims_are_there() -> None:
+    claims = {one.claim for one in EXPERIMENTS.values()}
+    assert {f"E{k}" for k in range(1, 12)} <= claims
+
+
+def test_a_wrong_name_is_answered_with_the_right_one() -> None:
+    with pytest.raises(ValueError, match=r"got 'circle-narow'; did you mean 'circle-narrow'\?"):
+        find("circle-narow")
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=EXPERIMENTS)
+def test_entries_are_complete(experiment: Experiment) -> None:
+    assert experiment.thesis
+    assert experiment.checks
+    names = [setting.name for setting in experiment.settings]
+    assert len(set(names)) == len(names)
+    assert experiment.seeds >= 10
+    assert experiment.test_episodes >= 10
+    for check in experiment.checks:
+        assert any(check.statement.startswith(f"{name}: ") for name in names)
+    if what_is_missing(experiment) is None:
+        plan = make_plan(experiment)
+        assert len(plan.items) == len(experiment.settings) * len(experiment.agents)
+        assert plan.settings()["seeds"] == list(range(1, 11))
+
+
+def test_hyperparameters_are_those_of_the_zoo() -> None:
+    plan = make_plan(find("sparse-fixed-entropy"))
+    for item in plan.items:
+        algo = {"gauss": "sac_gauss", "lowrank": "sac_lowrank", "flow": "sac_flow"}[item.agent]
+        block = load_hyperparameters(algo, item.env_id)
+        assert block.pop("n_timesteps") == item.steps
+        assert item.hyperparameters == {**block, "ent_coef": "auto"}
+    default_init = make_plan(find("circle-fixed-alpha")).items[3]
+    assert default_init.hyperparameters["policy_kwargs"]["net_arch"] == [128, 128]
+    assert default_init.hyperparameters["policy_kwargs"]["distribution_kwargs"]["init"] == "default"
+
+
+def test_variants_of_an_environment_keep_its_vectorised_form() -> None:
+    item = make_plan(find("diagonal-dimensions")).items[-1]
+    name = environment(item)
+    assert environment(item) == name
+    venv = gym.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point")
+    assert venv.single_action_space.shape == (32,)
+    venv.reset(seed=0)
+    action = np.ones((2, 32), np.float32)
+    for _ in range(7):
+        *_, terminated, _, infos = venv.step(action)
+    assert terminated.all()
+    assert infos["is_success"].all() or infos["final_info"]["is_success"].all()
+
+
+def test_seeds_split_into_items() -> None:
+    plan = make_plan(find("circle-narrow"), seeds=5, seeds_per_item=2, first_seed=100)
+    assert [item.seeds for item in plan.items[:3]] == [(100, 101), (102, 103), (104,)]
+    keys = [item.key for item in plan.items]
+    assert len(set(keys)) == len(keys) == 9
+
+
+def test_costs_add_up() -> None:
+    plan = make_plan(find("sparse-fixed-alpha"))
+    seconds = [item_seconds(item) for item in plan.items]
+    assert plan_seconds(plan, 1) == pytest.approx(sum(seconds))
+    assert plan_seconds(plan, 100) == max(seconds)
+    assert in_words(60 * 45) == "45 min"

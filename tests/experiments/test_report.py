@@ -1,0 +1,189 @@
+"""Verdicts, tables and the page, from made-up results whose verdicts are known."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from sb3_flowpolicy.experiments import statistics
+from sb3_flowpolicy.experiments.__main__ import main
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.experiment import (
+    GAUSS,
+    NOT_MEASURED,
+    NOT_REPRODUCED,
+    PARTLY,
+    REPRODUCED,
+)
+from sb3_flowpolicy.experiments.manifest import find
+from sb3_flowpolicy.experiments.report import Section, read_results, write_docs, write_report
+from sb3_flowpolicy.experiments.store import ItemFiles
+from tests.experiments.conftest import MakeUp
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+
+
+@pytest.fixture(autouse=True)
+def _few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Intervals are tested elsewhere; here they would only take time."""
+    monkeypatch.setattr(statistics, "RESAMPLES", 40)
+
+
+def evidence(name: str, folder: Path) -> Evidence:
+    return Evidence(find(name), folder / name)
+
+
+@pytest.mark.parametrize(
+    ("levels", "verdict"),
+    [
+        ({"diagonal-gauss": 0.0}, REPRODUCED),
+        ({}, PARTLY),  # Gauss should have failed
+        ({"gauss": 0.5}, PARTLY),  # and not on the horizontal path
+        ({"diagonal-gauss": 1.0, "gauss": 0.0, "lowrank": 0.0, "flow": 0.0}, NOT_REPRODUCED),
+    ],
+)
+def test_a_rule_is_the_sum_of_its_checks(
+    levels: dict[str, float], verdict: str, make_up: MakeUp, tmp_path: Path
+) -> None:
+    make_up("sparse-fixed-alpha", levels or {"nobody": 0.0})
+    found, findings = find("sparse-fixed-alpha").judge(evidence("sparse-fixed-alpha", tmp_path))
+    assert found == verdict
+    for finding, (path, agent) in zip(
+        findings,
+        itertools.product(("horizontal", "diagonal"), ("gauss", "lowrank", "flow")),
+        strict=True,
+    ):
+        level = levels.get(f"{path}-{agent}", levels.get(agent, 1.0))
+        assert finding.measured == ("10 of 10" if level == 1.0 else "0 of 10")
+
+
+def test_verdicts_of_the_circle(make_up: MakeUp, tmp_path: Path) -> None:
+    levels = {"gauss": 0.98, "lowrank": 1.0, "flow": 1.04, "flow-default-init": 0.0}
+    make_up("circle-fixed-alpha", levels)
+    verdict, _ = find("circle-fixed-alpha").judge(evidence("circle-fixed-alpha", tmp_path))
+    assert verdict == REPRODUCED
+    shutil.rmtree(tmp_path / "circle-fixed-alpha")
+    make_up("circle-fixed-alpha", {"gauss": 1.5, "lowrank": 0.0, "flow": 0.0})
+    verdict, findings = find("circle-fixed-alpha").judge(evidence("circle-fixed-alpha", tmp_path))
+    assert verdict == NOT_REPRODUCED
+    assert findings[-1].measured == "0 of 10"
+
+
+def test_what_did_not_finish_is_not_judged(make_up: MakeUp, tmp_path: Path) -> None:
+    plan = make_up("circle-narrow")
+    ItemFiles(tmp_path / "circle-narrow", plan.items[0].key).done.unlink()
+    verdict, _ = find("circle-narrow").judge(evidence("circle-narrow", tmp_path))
+    assert verdict == NOT_MEASURED
+
+
+def test_a_seed_that_fails_is_counted(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("circle-fixed-alpha")
+    path = tmp_path / "circle-fixed-alpha" / "circle-flow.csv"
+    # Column 7 is the test success: seed 3 never succeeds.
+    path.write_text(
+        re.sub(r"(?m)^(3,\d+,\d+,[^,]*,[^,]*,[^,]*),[^,]*,", r"\1,0,", path.read_text())
+    )
+    found = evidence("circle-fixed-alpha", tmp_path)
+    assert found.solved("circle", "flow").sum() == 9
+    assert found.steps_until_solved("circle", "flow").tolist()[2] == 60_000
+    _, findings = find("circle-fixed-alpha").judge(found)
+    assert findings[-1].holds is False
+    assert findings[-1].measured == "9 of 10"
+
+
+def test_oscillations_are_what_all_three_curves_do(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("circle-narrow", {"gauss": 1.0})
+    steady = evidence("circle-narrow", tmp_path)
+    assert steady.oscillations("narrow", "gauss").max() == 0
+    path = tmp_path / "circle-narrow" / "narrow-gauss.csv"
+    lines = path.read_text().splitlines()
+    for k, line in enumerate(lines[1:], start=1):
+        cells = line.split(",")
+        up = int(float(cells[1])) // 6000 % 2
+        cells[3], cells[4], cells[7] = str(2.0 * up), str(0.1 + up / 2), str(-4.0 + 2 * up)
+        if int(cells[0]) <= 5:  # the temperature of the other seeds stays where it is
+            cells[8] = str(0.01 * 3**up)
+        lines[k] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    counts = evidence("circle-narrow", tmp_path).oscillations("narrow", "gauss")
+    assert (counts[:5] >= 7).all()
+    assert counts[5:].max() <= 1
+
+
+def test_a_try_out_is_no_result(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("sparse-fixed-entropy", seeds=3)
+    assert Section(evidence("sparse-fixed-entropy", tmp_path)).is_short
+    make_up("circle-narrow")
+    assert not Section(evidence("circle-narrow", tmp_path)).is_short
+
+
+def test_a_corrupt_line_stops_the_report(
+    make_up: MakeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_up("circle-narrow", seeds=2)
+    path = tmp_path / "circle-narrow" / "narrow-flow.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    lines[6] = lines[6].replace(",", ";")
+    path.write_text("".join(lines))
+    assert main(["report", "--results", str(tmp_path)]) == 1
+    assert "narrow-flow.csv, line 7 must hold 9 finite numbers" in capsys.readouterr().err
+
+
+def test_docs_hold_tables_figures_and_data(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("circle-fixed-entropy", seeds=3)
+    docs = tmp_path / "docs"
+    text = write_docs(tmp_path, docs).read_text()
+    for link in re.findall(r"\]\((experiments/[^)]+\.png)\)", text):
+        assert (docs / link).read_bytes().startswith(b"\x89PNG")
+    assert len(re.findall(r"!\[circle-fixed-entropy", text)) == 3
+    assert f"| circle | {GAUSS.label} | 3 |" in text
+    assert "try-out, not a result" in text
+    # What is committed is enough to make the page again.
+    again = [one.experiment.name for one in read_results(docs / "experiments") if one.complete]
+    assert again == ["circle-fixed-entropy"]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_the_page_works_offline_in_a_browser(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("circle-fixed-entropy", seeds=3)
+    from plotly.offline import get_plotlyjs
+
+    page = write_report(tmp_path, tmp_path / "report.html")
+    text = page.read_text()
+    assert len(text) < 6_000_000
+    ours = text.replace(get_plotlyjs(), "")
+    assert not re.findall(r'(?:src|href)="(?!#|data:)', ours)
+    expected = text.count('class="plot"')
+    assert expected == 6
+    for width in (390, 1200):  # a phone, and a desk; tall enough for all of it to be in view
+        run = subprocess.run(
+            [
+                str(CHROMIUM),
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--host-resolver-rules=MAP * ~NOTFOUND",
+                "--enable-logging=stderr",
+                f"--user-data-dir={tmp_path / 'profile'}",
+                f"--window-size={width},30000",
+                "--virtual-time-budget=30000",
+                "--dump-dom",
+                page.as_uri(),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
+        )
+        assert "CONSOLE" not in run.stderr
+        body = run.stdout[run.stdout.index("<body>") :]
+        assert len(re.findall(r'class="main-svg"[^>]*>(?=<defs)', body)) >= expected
+        assert body.count("js-plotly-plot") == expected
+        # Each plot has lines in it: seeds, band and mean of three agents.
+        assert body.count('class="js-line"') >= expected * 6
+        assert "Policies in their tunnel" in body
