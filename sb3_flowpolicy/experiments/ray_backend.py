@@ -31,7 +31,7 @@ def run_on_ray(
         folder: Folder of the experiment, claimed; only this machine needs to see it.
         items: What to do.
         progress: Shows how far they are.
-        address: Cluster to join; Default: the one that this process is connected to, that of the
+        address: Cluster to join. Default: the one that this process is connected to, that of the
             variable ``RAY_ADDRESS``, or a new one on this machine alone.
 
     Raises:
@@ -43,6 +43,7 @@ def run_on_ray(
     try:
         import ray
         from ray.exceptions import RayError, RayTaskError
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             '--backend ray needs Ray: pip install "sb3_flowpolicy[distributed]"'
@@ -54,7 +55,9 @@ def run_on_ray(
         except ConnectionError as error:
             raise RuntimeError(f"no Ray cluster answers at {address!r}: {error}") from error
     environment = {"env_vars": dict.fromkeys(ONE_THREAD, "1")}
-    board = ray.remote(_Board).options(num_cpus=0, runtime_env=environment).remote()
+    # Beside the runner: on another machine it would be lost with it.
+    here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+    board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
     task = ray.remote(_run_away).options(
         num_cpus=1, max_retries=MOST_RETRIES, runtime_env=environment
     )

@@ -23,7 +23,7 @@ def test_no_seed_is_lost_with_a_node(tiny: Experiment, tmp_path: Path) -> None:
 
     from sb3_flowpolicy.experiments.ray_backend import run_on_ray
 
-    plan = make_plan(tiny, seeds=4, seeds_per_item=1, steps=600)
+    plan = make_plan(tiny, seeds=4, seeds_per_item=1, steps=300)
     assert len(plan.items) == 8
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     try:
