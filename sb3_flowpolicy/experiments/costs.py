@@ -5,16 +5,17 @@ from __future__ import annotations
 from sb3_flowpolicy.experiments.work import Plan, WorkItem
 
 STEPS_PER_SECOND = {
-    16: {"sac_gauss": 3000.0, "sac_lowrank": 2400.0, "sac_flow": 2200.0},
+    16: {"sac_gauss": 3300.0, "sac_lowrank": 2450.0, "sac_flow": 2400.0},
     128: {"sac_gauss": 390.0, "sac_lowrank": 370.0, "sac_flow": 340.0},
-    256: {"sac_gauss": 100.0, "sac_lowrank": 98.0, "sac_flow": 95.0},
+    256: {"sac_gauss": 105.0, "sac_lowrank": 103.0, "sac_flow": 99.0},
 }
 """Units of the critics' layers -> agent -> steps per second, summed over ten seeds of one process
-with one thread, measurements included, on one of two cores of an AMD EPYC.
+with one thread, on one of two idle cores of an AMD EPYC (docs/benchmarks.md).
 
-16 and 128: ``steps_per_second`` in the ``.done.json`` of runs. 256: updates of single agents
-(docs/benchmarks.md), as ten seeds gain nothing where matrix products are the limit. All blocks do
-one update per step, which is what takes the time.
+16: ``learn()`` of ten seeds; for sac_lowrank, sac_gauss's rate times their ratio as single agents.
+128 and 256: updates of single agents, as ten seeds gain nothing where matrix products are the
+limit. All blocks do one update per step, which is what takes the time. What a run really took is in
+its ``.done.json`` files.
 """
 
 _START_SECONDS = 40

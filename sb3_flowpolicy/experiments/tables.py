@@ -88,10 +88,10 @@ def facts(evidence: Evidence) -> dict[str, str]:
     found["items"] = f"{len(done)} of {len(evidence.items)} finished"
     if done:
         machine = done[-1]["machine"]
-        hours = sum(one["seconds"] for one in done) / 3600
+        hours = sum(one["cpu_seconds"] for one in done) / 3600
         speeds = [one["steps_per_second"] for one in done]
         found["cost"] = (
-            f"{hours:.2f} core hours, {min(speeds):,.0f} to {max(speeds):,.0f} steps per second "
+            f"{hours:.2f} core hours; {min(speeds):,.0f} to {max(speeds):,.0f} steps per second "
             "and process, seeds summed"
         )
         found["commit"] = ", ".join(sorted({str(one["machine"]["commit"]) for one in done}))

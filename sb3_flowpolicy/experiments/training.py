@@ -66,7 +66,8 @@ class _Training:
         self.item, self.files, self.report = item, files, report
         self.env = environment(item)
         self.started = time.perf_counter()
-        self.seconds_before, self.sessions = 0.0, 1
+        self.cpu_started = time.process_time()
+        self.seconds_before, self.cpu_before, self.sessions = 0.0, 0.0, 1
         self.done_steps = 0
         self.batch = self._resume() or self._begin()
         self.tests = DeterministicEpisodes(self.env, len(item.seeds), item.test_episodes)
@@ -114,7 +115,8 @@ class _Training:
         state = read_json(found[-1] / "state.json")
         self.files.cut_to(state["lengths"])
         self.done_steps = state["step"]
-        self.seconds_before, self.sessions = state["seconds"], state["sessions"] + 1
+        self.seconds_before, self.cpu_before = state["seconds"], state["cpu_seconds"]
+        self.sessions = state["sessions"] + 1
         return SeedBatch.load(found[-1], self.env)
 
     def _save(self) -> None:
@@ -127,6 +129,7 @@ class _Training:
             "step": self.done_steps,
             "lengths": self.files.lengths(),
             "seconds": self._seconds(),
+            "cpu_seconds": self._cpu_seconds(),
             "sessions": self.sessions,
         }
         write_json(partial / "state.json", state)
@@ -174,12 +177,17 @@ class _Training:
     def _seconds(self) -> float:
         return self.seconds_before + time.perf_counter() - self.started
 
+    def _cpu_seconds(self) -> float:
+        """What it would take on a core of its own: others may be using this one, too."""
+        return self.cpu_before + time.process_time() - self.cpu_started
+
     def _facts(self) -> dict:
         seconds = self._seconds()
         return {
             "steps": self.done_steps,
             "seeds": list(self.item.seeds),
             "seconds": round(seconds, 1),
+            "cpu_seconds": round(self._cpu_seconds(), 1),
             "steps_per_second": round(self.done_steps * len(self.item.seeds) / seconds, 1),
             "sessions": self.sessions,
             **self.files.lengths(),
