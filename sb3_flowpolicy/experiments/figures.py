@@ -69,15 +69,15 @@ def curves_figure(evidence: Evidence) -> Figure:
     rows = len(experiment.settings)
     figure = new_figure(3.3 * len(metrics), 2.5 * rows + 0.4)
     grid = figure.subplots(rows, len(metrics), squeeze=False)
-    for row, setting in zip(grid, experiment.settings, strict=True):
+    for k, (row, setting) in enumerate(zip(grid, experiment.settings, strict=True)):
         for axes, metric in zip(row, metrics, strict=True):
             for agent in experiment.agents:
                 if metric in evidence.columns(setting.name, agent.name):
                     _draw(axes, evidence, setting.name, agent, metric)
             _dress(axes, metric)
-            if row is grid[-1]:
+            if k == rows - 1:
                 axes.set_xlabel("environment steps", fontsize=8)
-            if row is grid[0]:
+            if k == 0:
                 axes.set_title(WORDS.get(metric, metric), fontsize=10)
         if rows > 1:
             row[0].set_ylabel(setting.name, fontsize=10)

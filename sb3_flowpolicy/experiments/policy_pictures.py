@@ -16,12 +16,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WALL, _GOAL = "#d62728", "#78c878"
+_VIEW = 1.6
+"""Half the edge of a view of the agent, in reaches."""
 
 
 def policies_figure(evidence: Evidence) -> Figure | None:
     """Draw each agent's action samples at several states of one test episode.
 
-    A row per setting, agent and moment of training, a column per state.
+    A row per setting, agent and moment of training; first the whole episode, then views of the
+    agent at several of its states.
 
     Args:
         evidence: Results, complete or not.
@@ -37,21 +40,21 @@ def policies_figure(evidence: Evidence) -> Figure | None:
     ]
     if not rows:
         return None
-    columns = max(len(picture["steps"]) for _, _, picture in rows)
-    figure = new_figure(2.1 * columns + 0.5, 2.15 * len(rows))
+    columns = 1 + max(len(picture["steps"]) for _, _, picture in rows)
+    figure = new_figure(2.0 * columns + 0.4, 2.15 * len(rows))
     grid = figure.subplots(len(rows), columns, squeeze=False)
     several = len(evidence.experiment.settings) > 1
     for line, (setting, agent, picture) in zip(grid, rows, strict=True):
         env = gym.make(setting.env_id, **setting.env_kwargs).unwrapped
         for axes in line:
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_color("#dddddd")
+        for axes in line[1 + len(picture["steps"]) :]:
             axes.set_axis_off()
-        for k, axes in zip(range(len(picture["steps"])), line, strict=False):
-            _draw_tunnel(axes, env)
+        _draw_world(line[0], env, picture)
+        for k, axes in zip(range(len(picture["steps"])), line[1:], strict=False):
             _draw_policy(axes, env, picture, k)
         where = f"{setting.name}, " if several else ""
-        line[0].set_axis_on()
-        line[0].set(xticks=[], yticks=[])
-        line[0].spines[:].set_visible(False)
         line[0].set_ylabel(
             f"{where}{agent.label}\nseed {picture['seed']}, {picture['step'] / 1000:g}k steps",
             fontsize=7,
@@ -71,18 +74,32 @@ def _draw_tunnel(axes: Axes, env: Any) -> None:
     axes.plot(*goal.T, color=_GOAL, linewidth=5, solid_capstyle="butt")
     for side in (-1, 1):
         axes.plot(*(centre + side * across).T, color=_WALL, linewidth=0.7)
+
+
+def _draw_world(axes: Axes, env: Any, picture: dict[str, Any]) -> None:
+    _draw_tunnel(axes, env)
+    trail = np.array(picture["trail"])
+    axes.plot(*trail.T, color="black", linewidth=0.6, marker=".", markersize=3)
     axes.set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
+    axes.set_title("the episode", fontsize=7)
 
 
 def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:
     position = np.array(picture["positions"][k])
     trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
     reach = env.config.reach
+    _draw_tunnel(axes, env)
     ends = position + reach * np.array(picture["samples"][k])
     axes.scatter(trail[:, 0], trail[:, 1], s=4, color="#969696", linewidths=0)
     axes.add_patch(_box(position, reach))
     axes.scatter(ends[:, 0], ends[:, 1], s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
     axes.scatter(position[0], position[1], s=10, color="black", zorder=3)
+    view = _VIEW * reach
+    axes.set(
+        xlim=(position[0] - view, position[0] + view),
+        ylim=(position[1] - view, position[1] + view),
+        aspect="equal",
+    )
     axes.set_title(f"step {picture['steps'][k]}", fontsize=7)
 
 
