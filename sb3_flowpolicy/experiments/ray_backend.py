@@ -72,9 +72,9 @@ def run_on_ray(
                 _collect(ItemFiles(folder, item.key), ray.get(reference))
                 progress.update(item.key, item.steps)
     except RayTaskError as error:
-        cause = error.cause
-        if isinstance(cause, OSError | ValueError):
-            raise type(cause)(f"on another machine: {cause}") from error
+        for kind in (OSError, ValueError):
+            if isinstance(error.cause, kind):
+                raise kind(f"on another machine: {error.cause}") from error
         raise RuntimeError(f"an item failed on another machine: {error}") from error
     except RayError as error:
         raise RuntimeError(
