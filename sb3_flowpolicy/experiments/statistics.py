@@ -180,16 +180,17 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
 def swings(values: np.ndarray, amplitude: float) -> int:
     """Count how often a curve turns round after moving at least ``amplitude`` one way.
 
-    Small wiggles do not count: a turn is one only if the curve then moves by ``amplitude`` the
-    other way, too. A monotonic curve has none, a sine over three periods five or six.
+    Small wiggles do not count: a turn is one only if the curve has moved by ``amplitude`` one way
+    and then moves by ``amplitude`` the other way. A monotonic curve has none, a square wave over
+    three periods five.
 
     Args:
         values: The curve, (T,).
         amplitude: Least difference between a high and the low that follows, above 0.
 
     Example:
-        >>> swings(np.sin(np.linspace(0, 6 * np.pi, 200)), 1.5)
-        5
+        >>> swings(np.array([0.0, 1.0, 0.1, 0.2, 0.9, 0.0]), 0.5)
+        3
         >>> swings(np.linspace(0, 9, 50), 1.5)
         0
     """
