@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 # From the ground up. A package may import those before it, and nothing after.
 FLOORS = [
     "distributions",
+    "density",
     "policies",
     "engine",
     "demonstrations",
@@ -30,6 +31,7 @@ FLOORS = [
 ]
 THIRD_PARTY = {
     "distributions": {"torch"},
+    "density": {"torch", "numpy", "scipy", "sklearn", "matplotlib", "tqdm"},
     "policies": {"torch", "numpy", "gymnasium", "stable_baselines3"},
 }
 

@@ -1,0 +1,171 @@
+"""The models of the chapter behind one small interface: ours, and zuko's."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_flowpolicy.distributions import RealNVP
+
+# Thesis 2.1.2: eight layers, a two-layer network of ten units each.
+LAYERS, HIDDEN = 8, (10, 10)
+# Thesis 2.1.3: the condition passes a single linear layer of 16 units.
+ENCODER_UNITS = 16
+
+
+class FlowModel(nn.Module, ABC):
+    """A density over the plane, given a condition of C numbers (none where C = 0).
+
+    Calling it scores points; noise in, points out samples.
+
+    Attributes:
+        stackable: Whether ``torch.func.vmap`` can evaluate many copies at once.
+    """
+
+    stackable = True
+
+    @abstractmethod
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """Return log p(points | condition) in nats: (N, 2), (N, C) -> (N,)."""
+
+    @abstractmethod
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """Turn standard normal noise (N, 2) and conditions (N, C) into points (N, 2)."""
+
+
+class OurRealNVP(FlowModel):
+    """The policy's own flow, with a linear encoder; without a condition its context is 1.
+
+    Args:
+        condition_dim: Number C of conditioning variables.
+
+    Example:
+        >>> import torch as th
+        >>> model = OurRealNVP(condition_dim=0)
+        >>> noise, none = th.randn(5, 2), th.zeros(5, 0)
+        >>> th.equal(model.sample(noise, none), noise)  # the identity, until it is trained
+        True
+    """
+
+    def __init__(self, condition_dim: int) -> None:
+        super().__init__()
+        self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
+        context_dim = ENCODER_UNITS if condition_dim else 1
+        self.flow = RealNVP(2, context_dim, layers=LAYERS, hidden=HIDDEN)
+
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """Score points."""
+        return self.flow.log_prob(self.context(condition), points)
+
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """Draw points."""
+        return self.flow.rsample_and_log_prob(self.context(condition), noise)[0]
+
+    def context(self, condition: th.Tensor) -> th.Tensor:
+        """Encode conditions (N, C): (N, 16), or (N, 1) of ones where C = 0."""
+        if self.encoder is None:
+            return condition.new_ones(*condition.shape[:-1], 1)
+        return self.encoder(condition)
+
+    @th.no_grad()
+    def after_each_layer(self, noise: th.Tensor, condition: th.Tensor) -> list[th.Tensor]:
+        """Return the noise and its image after each coupling, L + 1 tensors (N, 2)."""
+        images = [noise]
+        shares = list(self.flow.context_proj(self.context(condition)).chunk(LAYERS, dim=-1))
+        value = noise
+        for pair in self.flow.pairs:
+            halves = list(value.split(1, dim=-1))
+            for turn, coupling in enumerate(pair.couplings):
+                shift, log_scale = coupling(halves[turn], shares.pop(0))
+                halves[1 - turn] = halves[1 - turn] * log_scale.exp() + shift
+                value = th.cat(halves, dim=-1)
+                images.append(value)
+        return images
+
+
+class ZukoModel(FlowModel):
+    """A flow of zuko's, with the same linear encoder.
+
+    Args:
+        flow: Name of a class in ``zuko.flows``.
+        condition_dim: Number C of conditioning variables.
+        stackable: Whether ``torch.func.vmap`` copes with it.
+        **settings: Passed to that class.
+
+    Raises:
+        ModuleNotFoundError: If zuko is missing, with what to install.
+
+    References:
+        Zuko: normalizing flows in PyTorch (Rozet et al., 2022).
+    """
+
+    def __init__(
+        self, flow: str, condition_dim: int, stackable: bool = True, **settings: Any
+    ) -> None:
+        super().__init__()
+        try:
+            # Imported here only: it switches off torch's checks of distributions everywhere.
+            zuko = import_module("zuko")
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                'this model needs zuko: pip install "sb3_flowpolicy[experiments]"'
+            ) from error
+        self.stackable = stackable
+        self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
+        self.flow = getattr(zuko.flows, flow)(2, ENCODER_UNITS if condition_dim else 0, **settings)
+
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """Score points."""
+        return self._given(condition).log_prob(points)
+
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """Draw points."""
+        return self._given(condition).transform.inv(noise)
+
+    def _given(self, condition: th.Tensor) -> Any:
+        return self.flow(None if self.encoder is None else self.encoder(condition))
+
+
+# Name -> (condition_dim -> model). Sizes are the thesis's; MODELS_NOTES say where they cannot be.
+MODELS: dict[str, Callable[[int], FlowModel]] = {
+    "realnvp": OurRealNVP,
+    "zuko-realnvp": lambda c: ZukoModel("RealNVP", c, transforms=LAYERS, hidden_features=HIDDEN),
+    "maf": lambda c: ZukoModel("MAF", c, transforms=LAYERS, hidden_features=HIDDEN),
+    "naf": lambda c: ZukoModel(
+        "NAF",
+        c,
+        stackable=False,
+        transforms=LAYERS,
+        signal=8,
+        hidden_features=HIDDEN,
+        network={"hidden_features": HIDDEN},
+    ),
+    "nsf": lambda c: ZukoModel("NSF", c, transforms=3, bins=8, hidden_features=HIDDEN),
+}
+
+
+def make_model(name: str, condition_dim: int, seed: int) -> FlowModel:
+    """Build a model with the initial weights of a seed.
+
+    Args:
+        name: A key of ``MODELS``.
+        condition_dim: Number C of conditioning variables, 0 for none.
+        seed: Seed of the weights; the global random state is left as it was.
+
+    Raises:
+        ValueError: If there is no such model.
+
+    Example:
+        >>> sum(p.numel() for p in make_model("realnvp", 0, seed=0).parameters())
+        1296
+    """
+    if name not in MODELS:
+        raise ValueError(f"model must be one of {list(MODELS)}, got {name!r}")
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(seed)
+        return MODELS[name](condition_dim)
