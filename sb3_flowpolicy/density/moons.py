@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import logsumexp
 
-# Gauss-Legendre nodes on the half circle. Neighbours are 0.016 apart, a third of the noise of
-# 0.05 that the chapter uses; the error is then far below 1e-6.
-N_NODES = 200
+# Gauss-Legendre nodes on the half circle: neighbours are at most 0.04 apart. Where that is no more
+# than the noise, the relative error is below 1e-8.
+N_NODES = 128
+MIN_NOISE = 0.04
 # Points scored at once: their distances to all nodes are held in memory together.
 CHUNK = 10_000
 # The integration grid: half the noise between neighbours, eight times the noise as margin.
@@ -24,7 +25,7 @@ def moon_log_density(points: np.ndarray, noise: float) -> np.ndarray:
 
     Args:
         points: Points x, shape (N, 2).
-        noise: Standard deviation :math:`\sigma`, at least 0.02.
+        noise: Standard deviation :math:`\sigma`, at least 0.04.
 
     Returns:
         log p(x) in nats, shape (N,).
@@ -38,8 +39,8 @@ def moon_log_density(points: np.ndarray, noise: float) -> np.ndarray:
         >>> bool(on_the_arc > 0 > beside)
         True
     """
-    if not noise >= 0.02:
-        raise ValueError(f"noise must be at least 0.02, got {noise}")
+    if not noise >= MIN_NOISE:
+        raise ValueError(f"noise must be at least {MIN_NOISE}, got {noise}")
     node, weight = np.polynomial.legendre.leggauss(N_NODES)
     angle = 0.5 * np.pi * (node + 1)
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)

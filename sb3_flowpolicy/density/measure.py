@@ -1,0 +1,175 @@
+"""Fit one model of one study with all its seeds, and measure what came out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_flowpolicy.density.datasets import AngleMoons, DataSet, Sample, Scaler
+from sb3_flowpolicy.density.ensemble import Ensemble
+from sb3_flowpolicy.density.fit import Curves, Data, fit, mean_nll
+from sb3_flowpolicy.density.integrate import integral
+from sb3_flowpolicy.density.models import FlowModel
+from sb3_flowpolicy.density.studies import STUDIES, Scale, Study, angles_to_score
+
+Row = dict[str, Any]
+# Samples of a seed are drawn with seeds of their own, far apart.
+VALIDATION_SEED, HELDOUT_SEED, ANGLE_SEED = 100_000, 200_000, 300_000
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A trained ensemble with everything that figures and tables need.
+
+    Args:
+        study: Name of the study.
+        model: Name of the model.
+        ensemble: The trained copies.
+        scalers: What each seed's points were standardised with.
+        curves: Likelihoods while training.
+        rows: One per seed, for ``fits.csv``.
+        angle_rows: One per seed and angle, for ``angles.csv``; empty for other studies.
+    """
+
+    study: str
+    model: str
+    ensemble: Ensemble
+    scalers: list[Scaler]
+    curves: Curves
+    rows: list[Row]
+    angle_rows: list[Row]
+
+    @property
+    def middle(self) -> int:
+        """Index of the seed with the middle likelihood: the one that pictures show."""
+        order = sorted(range(len(self.rows)), key=lambda i: self.rows[i]["nll"])
+        return order[(len(order) - 1) // 2]
+
+
+def fit_and_measure(
+    study_name: str, model: str, seeds: Sequence[int], scale: Scale, progress: bool = False
+) -> Fitted:
+    """Draw each seed's data, train its copy, and score it on data that nothing has seen.
+
+    Args:
+        study_name: A key of ``STUDIES``.
+        model: One of the study's models.
+        seeds: Seeds of weights and data.
+        scale: How much to compute.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The trained ensemble and its figures.
+    """
+    study = STUDIES[study_name]
+    data = study.data()
+    train = [data.draw(data.n_train, seed) for seed in seeds]
+    scalers = [data.scaler(sample) for sample in train]
+    others = _round_up(scale.n_validation, data), _round_up(scale.n_heldout, data)
+    validation = [data.draw(others[0], VALIDATION_SEED + seed) for seed in seeds]
+    heldout = [data.draw(others[1], HELDOUT_SEED + seed) for seed in seeds]
+
+    ensemble = Ensemble(model, data.condition_dim, seeds)
+    train_data = as_data(train, scalers)
+    curves = fit(
+        ensemble,
+        train_data,
+        as_data(validation, scalers),
+        study.recipe(model, scale),
+        seed=min(seeds),
+        progress=progress,
+    )
+    with th.no_grad():
+        train_nll = -ensemble.log_prob(train_data.points, train_data.condition).mean(1)
+        held = as_data(heldout, scalers)
+        log_q = ensemble.log_prob(held.points, held.condition).double().numpy()
+    entropy = data.entropy()
+    accuracy = _accuracy(ensemble, held) if study_name == "two-moons-label" else None
+    rows = []
+    for i, seed in enumerate(seeds):
+        # The true density of the standardised points.
+        log_p = data.log_density(heldout[i]) + scalers[i].log_volume
+        gap = log_p - log_q[i]
+        integrals = _integrals(ensemble.member(i), study, scale)
+        rows.append(
+            {
+                "study": study_name,
+                "model": model,
+                "seed": seed,
+                "best_epoch": int(curves.best_epoch[i]),
+                "train_nll": float(train_nll[i]),
+                "nll": float(-log_q[i].mean()),
+                "nll_se": _standard_error(log_q[i]),
+                "entropy": entropy - scalers[i].log_volume,
+                "gap": float(gap.mean()),
+                "gap_se": _standard_error(gap),
+                "integral_low": min(integrals),
+                "integral_high": max(integrals),
+                "accuracy": "" if accuracy is None else float(accuracy[i]),
+            }
+        )
+    angle_rows = _angle_rows(ensemble, scale) if study_name == "angle-moons" else []
+    return Fitted(study_name, model, ensemble, scalers, curves, rows, angle_rows)
+
+
+def as_data(samples: Sequence[Sample], scalers: Sequence[Scaler]) -> Data:
+    """Standardise one sample per seed and stack them for a model."""
+    points = [scaler.apply(one.points) for one, scaler in zip(samples, scalers, strict=True)]
+    conditions = np.stack([one.condition for one in samples])
+    return Data(th.from_numpy(np.stack(points)).float(), th.from_numpy(conditions).float())
+
+
+@th.no_grad()
+def label_posterior(log_prob: Callable[[th.Tensor], th.Tensor], shape: Sequence[int]) -> th.Tensor:
+    """Return p(label = 1 | point) for labels that are equally frequent.
+
+    Args:
+        log_prob: Conditions (*shape, 1) -> log p(points | condition), shape (*shape).
+        shape: Shape of the points without their coordinates.
+    """
+    zero, one = (log_prob(th.full((*shape, 1), label)) for label in (0.0, 1.0))
+    return th.sigmoid(one - zero)
+
+
+def _accuracy(ensemble: Ensemble, held: Data) -> th.Tensor:
+    """Return each seed's share of points that are more likely under their own label, (S,)."""
+    shape = held.points.shape[:-1]
+    posterior = label_posterior(lambda label: ensemble.log_prob(held.points, label), shape)
+    return ((posterior > 0.5) == (held.condition[..., 0] > 0.5)).double().mean(1)
+
+
+def _integrals(model: FlowModel, study: Study, scale: Scale) -> list[float]:
+    conditions = th.from_numpy(study.conditions(scale)).float()
+    return [integral(model, condition, scale.cells) for condition in conditions]
+
+
+@th.no_grad()
+def _angle_rows(ensemble: Ensemble, scale: Scale) -> list[Row]:
+    """Score fresh points at single angles: the same noise at each, so that angles compare."""
+    rows = []
+    for kind, angles in angles_to_score(scale).items():
+        for angle in angles:
+            one = AngleMoons(np.array([angle]))
+            samples = [one.draw(scale.n_per_angle, ANGLE_SEED + s) for s in ensemble.seeds]
+            data = as_data(samples, [one.scaler(sample) for sample in samples])
+            nll = mean_nll(ensemble, data)
+            rows += [
+                {"seed": seed, "kind": kind, "angle": round(float(angle), 4), "nll": float(value)}
+                for seed, value in zip(ensemble.seeds, nll, strict=True)
+            ]
+    return rows
+
+
+def _standard_error(values: np.ndarray) -> float:
+    return float(values.std(ddof=1) / math.sqrt(len(values)))
+
+
+def _round_up(n: int, data: DataSet) -> int:
+    """Return the least number of points that gives every angle equally many."""
+    n_groups = len(data.angles) if isinstance(data, AngleMoons) else 2
+    return -(-n // n_groups) * n_groups
