@@ -31,7 +31,7 @@ FLOORS = [
 ]
 THIRD_PARTY = {
     "distributions": {"torch"},
-    "density": {"torch", "numpy", "scipy", "sklearn", "matplotlib", "tqdm"},
+    "density": {"torch", "numpy", "scipy", "sklearn", "matplotlib", "PIL", "tqdm"},
     "policies": {"torch", "numpy", "gymnasium", "stable_baselines3"},
 }
 

@@ -36,26 +36,31 @@ class Ensemble:
         models = [make_model(name, condition_dim, seed) for seed in seeds]
         self._template = models[0]
         self.weights: Weights = stack_module_state(models)[0]
-        # Masks and the like: the same for all, and indexing by them does not stack.
-        self._buffers = dict(self._template.named_buffers())
+        # Masks and the like. Where they are the same for all they stay single: zuko's couplings
+        # index by theirs, which does not stack.
+        each = [dict(model.named_buffers()) for model in models]
+        stacks = {key: th.stack([one[key] for one in each]) for key in each[0]}
+        self._own = {key: value for key, value in stacks.items() if (value != value[:1]).any()}
+        self._shared = {key: value for key, value in each[0].items() if key not in self._own}
 
     def log_prob(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
         """Score points of each copy's own: (S, N, 2), (S, N, C) -> (S, N), in nats."""
 
-        def score(weights: Weights, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-            state = (weights, self._buffers)
-            return functional_call(self._template, state, (points, condition))
+        def score(state: Weights, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+            return functional_call(self._template, {**state, **self._shared}, (points, condition))
 
+        states = {**self.weights, **self._own}
         if self._template.stackable:
-            return vmap(score)(self.weights, points, condition)
+            return vmap(score)(states, points, condition)
         each = zip(points, condition, strict=True)
-        return th.stack([score(self._of(i), x, c) for i, (x, c) in enumerate(each)])
+        return th.stack([score(_of(states, i), x, c) for i, (x, c) in enumerate(each)])
 
     def member(self, index: int) -> FlowModel:
         """Return one copy as an ordinary module with weights of its own."""
         model = make_model(self.name, self.condition_dim, self.seeds[index])
-        model.load_state_dict(self._of(index), strict=False)
+        model.load_state_dict(_of(self.weights, index), strict=False)
         return model.eval()
 
-    def _of(self, index: int) -> Weights:
-        return {name: value[index] for name, value in self.weights.items()}
+
+def _of(states: Weights, index: int) -> Weights:
+    return {name: value[index] for name, value in states.items()}

@@ -131,11 +131,16 @@ class ZukoModel(FlowModel):
         return self.flow(None if self.encoder is None else self.encoder(condition))
 
 
-# Name -> (condition_dim -> model). Sizes are the thesis's; MODELS_NOTES say where they cannot be.
+# Name -> (condition_dim -> model). Sizes are the thesis's; of the spline flow, which it did not
+# have, they are the library's usual three transforms of eight bins.
 MODELS: dict[str, Callable[[int], FlowModel]] = {
     "realnvp": OurRealNVP,
     "zuko-realnvp": lambda c: ZukoModel("RealNVP", c, transforms=LAYERS, hidden_features=HIDDEN),
     "maf": lambda c: ZukoModel("MAF", c, transforms=LAYERS, hidden_features=HIDDEN),
+    # Random orders repeat themselves half the time in the plane: some layers then add nothing.
+    "maf-random": lambda c: ZukoModel(
+        "MAF", c, transforms=LAYERS, hidden_features=HIDDEN, randperm=True
+    ),
     "naf": lambda c: ZukoModel(
         "NAF",
         c,

@@ -100,6 +100,7 @@ STUDIES = {
                 "realnvp": Recipe(epochs=1000),
                 "zuko-realnvp": Recipe(epochs=1000),
                 "maf": Recipe(epochs=1000),
+                "maf-random": Recipe(epochs=1000),
                 # A step of these costs several times as much, and they need fewer.
                 "naf": Recipe(epochs=300),
                 "nsf": Recipe(epochs=300),

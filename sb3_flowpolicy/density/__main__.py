@@ -1,0 +1,118 @@
+"""`python -m sb3_flowpolicy.density`: run the density fitting chapter and report on it."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import sb3_flowpolicy
+
+EPILOG = """examples:
+  python -m sb3_flowpolicy.density list
+  python -m sb3_flowpolicy.density run two-moons-label          one study, ten seeds
+  python -m sb3_flowpolicy.density run --quick                  everything, to see that it works
+  python -m sb3_flowpolicy.density run --jobs 2 && python -m sb3_flowpolicy.density report
+"""
+DEFAULT_FOLDER = Path("density_results")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Do what the command line says.
+
+    Args:
+        arguments: Command line without the program's name. Default: that of the process.
+    """
+    parser = _parser()
+    args = parser.parse_args(arguments)
+    # Slow imports, which --help can do without.
+    try:
+        from sb3_flowpolicy.density.report import write_report
+        from sb3_flowpolicy.density.run import run_studies
+        from sb3_flowpolicy.density.studies import FULL, QUICK, STUDIES
+    except ModuleNotFoundError as error:
+        parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
+
+    if args.action == "list":
+        for study in STUDIES.values():
+            print(f"{study.name} ({study.claim}): {study.title}")
+            print(f"  models: {', '.join(study.recipes)}")
+            print(f"  thesis: {study.thesis}\n  to hold: {study.rules}\n")
+        return
+    try:
+        if args.action == "run":
+            begin = time.monotonic()
+            if args.seeds < 1:
+                raise ValueError(f"seeds must be at least 1, got {args.seeds}")
+            seeds = range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds))
+            run_studies(
+                args.names or list(STUDIES),
+                seeds,
+                QUICK if args.quick else FULL,
+                args.out,
+                args.jobs,
+                progress=not args.no_progress,
+            )
+            took = f"{(time.monotonic() - begin) / 60:.1f} minutes"
+            (args.out / "origin.txt").write_text(_origin(arguments, took))
+            print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
+        else:
+            origin = args.out / "origin.txt"
+            print(write_report(args.out, origin.read_text() if origin.exists() else ""))
+    except ValueError as error:
+        parser.error(str(error))
+
+
+def _origin(arguments: list[str] | None, took: str) -> str:
+    given = sys.argv[1:] if arguments is None else arguments
+    command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
+    return f"Made by `{command}` at commit {_commit()}, in {took}."
+
+
+def _commit() -> str:
+    """Return the commit of the source tree, or that there is none."""
+    folder = Path(sb3_flowpolicy.__file__).parent
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown (no source tree)"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.density",
+        description="Fit small normalizing flows to data in the plane, as in chapter 2.1 of the "
+        "thesis, and compare their held-out likelihood with the data's exact entropy.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", required=True, metavar="list|run|report")
+    actions.add_parser("list", help="show the studies, what the thesis found, and what must hold")
+    run = actions.add_parser("run", help="fit, measure and draw; tables and pictures go to --out")
+    run.add_argument("names", nargs="*", metavar="NAME", help="studies (default: all)")
+    run.add_argument("--seeds", type=int, default=10, help="number of seeds (default: 10)")
+    run.add_argument("--first-seed", type=int, default=0, help="first of them (default: 0)")
+    run.add_argument(
+        "--quick", action="store_true", help="two seeds, hardly trained, within a minute"
+    )
+    run.add_argument(
+        "--jobs", type=int, default=1, help="models fitted at the same time (default: 1)"
+    )
+    run.add_argument("--no-progress", action="store_true", help="no progress bars")
+    report = actions.add_parser("report", help="write README.md next to the results, and print it")
+    for sub in (run, report):
+        sub.add_argument(
+            "--out",
+            type=Path,
+            default=DEFAULT_FOLDER,
+            help=f"folder of the results (default: {DEFAULT_FOLDER})",
+        )
+    return parser
+
+
+if __name__ == "__main__":
+    main()
