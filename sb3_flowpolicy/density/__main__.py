@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import subprocess
 import sys
@@ -56,7 +57,10 @@ def main(arguments: list[str] | None = None) -> None:
                 args.jobs,
                 progress=not args.no_progress,
             )
-            took = f"{(time.monotonic() - begin) / 60:.1f} minutes"
+            used = os.times()
+            cpu = used.user + used.system + used.children_user + used.children_system
+            wall = time.monotonic() - begin
+            took = f"{wall / 60:.1f} minutes ({cpu / 60:.1f} minutes of processor time)"
             (args.out / "origin.txt").write_text(_origin(arguments, took))
             print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
         else:

@@ -161,11 +161,10 @@ class AngleMoons(DataSet):
         if rest or n < 1:
             raise ValueError(f"n must be a multiple of {len(self.angles)} angles, got {n}")
         rng = np.random.default_rng(seed)
-        turn = rng.permutation(self.angles.repeat(per_angle))
+        order = rng.permutation(n)
+        turn = self.angles.repeat(per_angle)[order]
         # Evenly spaced along the arc, as make_moons does it.
-        along = np.empty(n)
-        for angle in self.angles:
-            along[turn == angle] = np.linspace(0, np.pi, per_angle)
+        along = np.tile(np.linspace(0, np.pi, per_angle), len(self.angles))[order]
         points = np.stack([np.cos(turn + along), np.sin(turn + along)], axis=1)
         points += NOISE * rng.standard_normal(points.shape)
         return Sample(points, angle_condition(turn))

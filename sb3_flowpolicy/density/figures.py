@@ -121,13 +121,12 @@ def curves_figure(
             axes.axhline(line[0], color=GREY, linestyle=":", linewidth=1)
             axes.annotate(
                 line[1],
-                (0.98, line[0]),
+                (0.02, line[0]),
                 (0, 3),
-                ha="right",
-                fontsize=7,
-                color=GREY,
                 xycoords=("axes fraction", "data"),
                 textcoords="offset points",
+                fontsize=7,
+                color=GREY,
             )
         axes.set(xlabel="epoch", ylim=(limit - 0.15, limit + 1.0), title=title)
         axes.spines[["top", "right"]].set_visible(False)

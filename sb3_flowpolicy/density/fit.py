@@ -37,7 +37,7 @@ class Recipe:
     """
 
     epochs: int
-    learning_rate: float = 1e-2
+    learning_rate: float = 2e-2
     jitter: float = 0.03
     max_grad_norm: float = 1.0
     averaging: float = 0.98

@@ -89,7 +89,7 @@ def draw_label(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     posterior = label_posterior(lambda label: model(plane, label), plane.shape[:-1])
     axes, box = panels[2], (-MOONS_EXTENT, MOONS_EXTENT, -MOONS_EXTENT, MOONS_EXTENT)
     axes.imshow(
-        posterior.reshape(scale.pixels, scale.pixels),
+        posterior.reshape(scale.pixels, scale.pixels).numpy(),
         origin="lower",
         extent=box,
         cmap=LinearSegmentedColormap.from_list("labels", ["#cfe0f0", "#ffffff", "#f6d9c8"]),

@@ -44,7 +44,7 @@ QUICK = Scale(
     n_validation=200,
     n_heldout=500,
     n_per_angle=50,
-    angle_step=0.8,
+    angle_step=0.4,
     cells=100,
     integral_angles=2,
     shrink=50,
@@ -143,7 +143,7 @@ STUDIES = {
             ),
             rules=(
                 "likelihood between training angles within 0.05 nats of that at training angles; "
-                "it worsens steadily outside"
+                "it worsens steadily over the first radian outside"
             ),
             conditions=_angles,
         ),

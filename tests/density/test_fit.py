@@ -1,0 +1,157 @@
+"""Ensembles equal their members, fits improve, densities integrate to one."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_flowpolicy.density.ensemble import Ensemble
+from sb3_flowpolicy.density.fit import Data, Recipe, fit, mean_nll
+from sb3_flowpolicy.density.integrate import density_picture, integral
+from sb3_flowpolicy.density.models import LAYERS, MODELS, FlowModel, OurRealNVP, make_model
+
+SEEDS = [0, 1, 2]
+
+
+def shifted_normal(n: int, seed: int, condition_dim: int = 0) -> Data:
+    """Samples of three seeds from a narrow normal away from the origin."""
+    generator = th.Generator().manual_seed(seed)
+    points = 0.5 * th.randn(3, n, 2, generator=generator) + th.tensor([1.0, -1.0])
+    return Data(points, th.rand(3, n, condition_dim, generator=generator))
+
+
+def shake(model: FlowModel, scale: float = 0.2) -> FlowModel:
+    """Move all weights: an identity flow would prove nothing."""
+    generator = th.Generator().manual_seed(1)
+    with th.no_grad():
+        for parameter in model.parameters():
+            parameter += scale * th.randn(parameter.shape, generator=generator)
+    return model
+
+
+@pytest.mark.parametrize("condition_dim", [0, 2])
+@pytest.mark.parametrize("name", MODELS)
+def test_an_ensemble_scores_as_its_members_do(name: str, condition_dim: int) -> None:
+    ensemble, data = Ensemble(name, condition_dim, SEEDS), shifted_normal(30, 0, condition_dim)
+    with th.no_grad():
+        together = ensemble.log_prob(data.points, data.condition)
+        for i in range(len(SEEDS)):
+            alone = ensemble.member(i)(data.points[i], data.condition[i])
+            th.testing.assert_close(together[i], alone, rtol=1e-4, atol=1e-4)
+    if name != "realnvp":  # ours starts as the identity, whatever the seed
+        assert not th.allclose(together[0], together[1])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_fits_improve(name: str) -> None:
+    ensemble, train, validation = (
+        Ensemble(name, 0, SEEDS),
+        shifted_normal(60, 0),
+        shifted_normal(60, 1),
+    )
+    before = mean_nll(ensemble, validation)
+    curves = fit(ensemble, train, validation, Recipe(epochs=6, check_every=2))
+    after = mean_nll(ensemble, validation)
+    assert (after < before).all()
+    # What is kept is what validated best.
+    th.testing.assert_close(after, curves.validation.min(0).values)
+    assert curves.epoch.tolist() == [2, 4, 6]
+
+
+def test_a_seed_does_not_feel_the_others() -> None:
+    """With the same order of points, clipping and averaging are each seed's own business."""
+    train, validation = shifted_normal(50, 0), shifted_normal(50, 1)
+    wild = Data(train.points.clone(), train.condition)
+    wild.points[1:] *= 100
+    nll = []
+    for data in (train, wild):
+        ensemble = Ensemble("realnvp", 0, SEEDS)
+        fit(ensemble, data, validation, Recipe(epochs=5, check_every=1))
+        nll.append(mean_nll(ensemble, validation))
+    th.testing.assert_close(nll[0][0], nll[1][0])
+    assert not th.isclose(nll[0][1], nll[1][1])
+
+
+def test_fitting_repeats_itself() -> None:
+    weights = []
+    for _ in range(2):
+        ensemble = Ensemble("realnvp", 0, SEEDS)
+        fit(ensemble, shifted_normal(50, 0), shifted_normal(50, 1), Recipe(epochs=3))
+        weights.append(ensemble.weights)
+    for key, value in weights[0].items():
+        th.testing.assert_close(value, weights[1][key], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ["realnvp", "zuko-realnvp", "maf", "nsf"])
+def test_densities_integrate_to_one(name: str) -> None:
+    model = shake(make_model(name, 2, seed=0))
+    assert integral(model, th.tensor([0.3, -1.0]), cells=300) == pytest.approx(1, abs=0.01)
+
+
+def test_a_wrong_log_determinant_is_seen() -> None:
+    class Wrong(FlowModel):
+        def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+            return -0.5 * points.square().sum(-1) - math.log(2 * math.pi) + 0.1
+
+        def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+            return noise
+
+    assert integral(Wrong(), th.zeros(0), cells=100) == pytest.approx(math.exp(0.1), rel=1e-4)
+
+
+def test_zukos_naf_loses_mass_before_training() -> None:
+    """Its layers do not reach the whole plane: why its integrals are reported."""
+    assert integral(make_model("naf", 0, seed=0).eval(), th.zeros(0), cells=100) < 0.01
+
+
+@pytest.mark.parametrize("condition_dim", [0, 1])
+def test_layers_end_at_the_sample(condition_dim: int) -> None:
+    model = shake(make_model("realnvp", condition_dim, seed=0))
+    assert isinstance(model, OurRealNVP)
+    noise, condition = th.randn(20, 2), th.rand(20, condition_dim)
+    images = model.after_each_layer(noise, condition)
+    assert len(images) == LAYERS + 1
+    assert th.equal(images[0], noise)
+    th.testing.assert_close(images[-1], model.sample(noise, condition).detach())
+    # Every layer moves one coordinate, in turns.
+    for layer, (before, after) in enumerate(pairwise(images)):
+        assert th.equal(before[:, layer % 2], after[:, layer % 2])
+        assert not th.equal(before[:, 1 - layer % 2], after[:, 1 - layer % 2])
+
+
+@pytest.mark.parametrize("name", ["zuko-realnvp", "maf", "nsf"])
+def test_samples_follow_the_density(name: str) -> None:
+    """What noise becomes, scored, is the noise's density over the volume change."""
+    model = shake(make_model(name, 1, seed=0)).double()
+    noise, condition = th.randn(4, 2, dtype=th.float64), th.rand(4, 1, dtype=th.float64)
+    points = model.sample(noise, condition)
+    for i in range(4):
+        jacobian = th.autograd.functional.jacobian(
+            lambda z, i=i: model.sample(z[None], condition[i : i + 1])[0], noise[i]
+        )
+        expected = -0.5 * noise[i].square().sum() - math.log(2 * math.pi)
+        expected = expected - jacobian.det().abs().log()
+        scored = model(points[i : i + 1], condition[i : i + 1])[0]
+        th.testing.assert_close(scored, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_density_picture_has_y_upwards() -> None:
+    model = make_model("realnvp", 0, seed=0)
+    image = density_picture(model, th.zeros(0), extent=2.0, cells=4)
+    centre = np.array([-1.5, -0.5, 0.5, 1.5])
+    expected = np.exp(-0.5 * (centre[:, None] ** 2 + centre**2)) / (2 * np.pi)
+    np.testing.assert_allclose(image, expected, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"extent and cells must be positive, got 0 and 4"):
+        density_picture(model, th.zeros(0), extent=0, cells=4)
+
+
+def test_bad_input_is_named() -> None:
+    with pytest.raises(ValueError, match=r"model must be one of .*'realnvp'.*, got 'glow'"):
+        make_model("glow", 0, seed=0)
+    data = shifted_normal(10, 0)
+    with pytest.raises(ValueError, match=r"epochs must be at least 1, got 0"):
+        fit(Ensemble("realnvp", 0, SEEDS), data, data, Recipe(epochs=0))
