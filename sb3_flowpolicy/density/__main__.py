@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
         return
     try:
         if args.action == "run":
-            begin = time.monotonic()
+            begin, commit = time.monotonic(), _commit()
             if args.seeds < 1:
                 raise ValueError(f"seeds must be at least 1, got {args.seeds}")
             seeds = range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds))
@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
             cpu = used.user + used.system + used.children_user + used.children_system
             wall = time.monotonic() - begin
             took = f"{wall / 60:.1f} minutes ({cpu / 60:.1f} minutes of processor time)"
-            (args.out / "origin.txt").write_text(_origin(arguments, took))
+            (args.out / "origin.txt").write_text(_origin(arguments, commit, took))
             print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
         else:
             origin = args.out / "origin.txt"
@@ -70,10 +70,10 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(str(error))
 
 
-def _origin(arguments: list[str] | None, took: str) -> str:
+def _origin(arguments: list[str] | None, commit: str, took: str) -> str:
     given = sys.argv[1:] if arguments is None else arguments
     command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
-    return f"Made by `{command}` at commit {_commit()}, in {took}."
+    return f"Made by `{command}` at commit {commit}, in {took}."
 
 
 def _commit() -> str:

@@ -146,9 +146,9 @@ MODELS: dict[str, Callable[[int], FlowModel]] = {
         c,
         stackable=False,
         transforms=LAYERS,
-        signal=8,
         hidden_features=HIDDEN,
-        network={"hidden_features": HIDDEN},
+        # The monotone network of a coordinate: one hidden layer of 16, as Huang et al. (2018).
+        network={"hidden_features": (16,)},
     ),
     "nsf": lambda c: ZukoModel("NSF", c, transforms=3, bins=8, hidden_features=HIDDEN),
 }
