@@ -147,7 +147,7 @@ MODELS: dict[str, Callable[[int], FlowModel]] = {
         stackable=False,
         transforms=LAYERS,
         hidden_features=HIDDEN,
-        # The monotone network of a coordinate: one hidden layer of 16, as Huang et al. (2018).
+        # The monotone network of a coordinate: one hidden layer of 16, Pyro's default.
         network={"hidden_features": (16,)},
     ),
     "nsf": lambda c: ZukoModel("NSF", c, transforms=3, bins=8, hidden_features=HIDDEN),

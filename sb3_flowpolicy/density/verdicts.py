@@ -45,21 +45,22 @@ def sound(rows: Sequence[Row]) -> list[Verdict]:
     """
     found = []
     for model, own in by_model(rows).items():
-        low = min(row["integral_low"] for row in own)
-        high = max(row["integral_high"] for row in own)
+        # numpy's extremes, unlike Python's, do not lose a NaN: it fails the comparison.
+        low = np.min([row["integral_low"] for row in own])
+        high = np.max([row["integral_high"] for row in own])
         found.append(
             Verdict(
                 f"{model}: every fitted density integrates to 1 ± {INTEGRAL_TOLERANCE}",
                 f"{low:.4f} to {high:.4f}",
-                1 - INTEGRAL_TOLERANCE <= low <= high <= 1 + INTEGRAL_TOLERANCE,
+                bool(low >= 1 - INTEGRAL_TOLERANCE and high <= 1 + INTEGRAL_TOLERANCE),
             )
         )
-        closest = min(row["gap"] / row["gap_se"] for row in own)
+        closest = np.min([row["gap"] / row["gap_se"] for row in own])
         found.append(
             Verdict(
                 f"{model}: no seed beats the entropy by more than {SAMPLING_ERRORS:.0f} errors",
                 f"closest seed {closest:+.1f} standard errors from it",
-                closest >= -SAMPLING_ERRORS,
+                bool(closest >= -SAMPLING_ERRORS),
             )
         )
     return found

@@ -133,6 +133,8 @@ def fit_row(model: str, nll: float, **changes: object) -> Row:
         ({"integral_low": 0.98}, [False, True]),
         ({"integral_high": 1.02}, [False, True]),
         ({"gap": -0.05}, [True, False]),
+        ({"gap": float("nan")}, [True, False]),
+        ({"integral_low": float("nan")}, [False, True]),
     ],
 )
 def test_soundness_catches_wrong_densities(change: Row, holds: list[bool]) -> None:
