@@ -101,7 +101,7 @@ STUDIES = {
                 "zuko-realnvp": Recipe(epochs=1000),
                 "maf": Recipe(epochs=1000),
                 "maf-random": Recipe(epochs=1000),
-                # A step of these costs several times as much: what fifteen minutes have room for.
+                # A step of these costs several times as much.
                 "naf": Recipe(epochs=400),
                 "nsf": Recipe(epochs=500),
             },
