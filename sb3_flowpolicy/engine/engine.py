@@ -279,7 +279,7 @@ class Engine:
         for k, batch in enumerate(batches, start):
             move_target = k % first.target_update_interval == 0
             if self._runs_compiled():
-                key = (batch.noise.shape, batch.obs.stride(), move_target)
+                key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), move_target)
                 losses = self._compiled_update(key, state, batch, learning_rates, move_target)
             else:
                 losses = self._update(state, batch, learning_rates, move_target)
