@@ -17,12 +17,31 @@ from typing import TYPE_CHECKING, Any
 from flowpolicy_envs.registration import register_envs
 
 if TYPE_CHECKING:
+    from flowpolicy_envs.square.env import SquareEnv
+    from flowpolicy_envs.square.holder import Holder
+    from flowpolicy_envs.square.tasks import FindGoal, Hold, Move, MoveX
+    from flowpolicy_envs.square.vector import SquareVectorEnv
     from flowpolicy_envs.tunnel.env import TunnelEnv
     from flowpolicy_envs.tunnel.vector import TunnelVectorEnv
 
-__all__ = ["TunnelEnv", "TunnelVectorEnv", "register_envs"]
+__all__ = [
+    "FindGoal",
+    "Hold",
+    "Holder",
+    "Move",
+    "MoveX",
+    "SquareEnv",
+    "SquareVectorEnv",
+    "TunnelEnv",
+    "TunnelVectorEnv",
+    "register_envs",
+]
 
 _LAZY = {
+    **dict.fromkeys(("FindGoal", "Hold", "Move", "MoveX"), "flowpolicy_envs.square.tasks"),
+    "Holder": "flowpolicy_envs.square.holder",
+    "SquareEnv": "flowpolicy_envs.square.env",
+    "SquareVectorEnv": "flowpolicy_envs.square.vector",
     "TunnelEnv": "flowpolicy_envs.tunnel.env",
     "TunnelVectorEnv": "flowpolicy_envs.tunnel.vector",
 }

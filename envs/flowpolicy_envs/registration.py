@@ -42,6 +42,20 @@ TUNNEL_IDS: dict[str, dict[str, Any]] = {
 _MAX_EPISODE_STEPS = {"TunnelSpline-v0": 60}
 """The spline is three times as long as the circle's way, so 40 steps would leave little slack."""
 
+_MOVE: dict[str, Any] = {"max_force": 1.95, "warm_up": 4.0}
+"""Four fingers at 1.95 N press with 7.8 N, three with 5.85 N; the weight of 3 N demands 6 N."""
+
+SQUARE_IDS: dict[str, dict[str, Any]] = {
+    "Square-v0": {},
+    "SquareHold-v0": {"task": "hold"},
+    "SquareMove-v0": {**_MOVE, "task": "move"},
+    "SquareMoveX-v0": {**_MOVE, "task": "move_x"},
+    "SquareFindGoal-v0": {**_MOVE, "task": "find_goal"},
+}
+"""Each Square id and the constructor arguments in which it differs from `Square-v0`."""
+
+_SQUARE_STEPS = {"Square-v0": 40, "SquareHold-v0": 40}
+
 
 def register_envs() -> None:
     """Register every environment of this package with gymnasium.
@@ -56,11 +70,19 @@ def register_envs() -> None:
         40
     """
     for env_id, kwargs in TUNNEL_IDS.items():
-        if env_id not in registry:
-            register(
-                id=env_id,
-                entry_point="flowpolicy_envs.tunnel.env:TunnelEnv",
-                vector_entry_point="flowpolicy_envs.tunnel.vector:TunnelVectorEnv",
-                max_episode_steps=_MAX_EPISODE_STEPS.get(env_id, 40),
-                kwargs=kwargs,
-            )
+        _register("tunnel", "Tunnel", env_id, _MAX_EPISODE_STEPS.get(env_id, 40), kwargs)
+    for env_id, kwargs in SQUARE_IDS.items():
+        _register("square", "Square", env_id, _SQUARE_STEPS.get(env_id, 80), kwargs)
+
+
+def _register(
+    package: str, name: str, env_id: str, max_episode_steps: int, kwargs: dict[str, Any]
+) -> None:
+    if env_id not in registry:
+        register(
+            id=env_id,
+            entry_point=f"flowpolicy_envs.{package}.env:{name}Env",
+            vector_entry_point=f"flowpolicy_envs.{package}.vector:{name}VectorEnv",
+            max_episode_steps=max_episode_steps,
+            kwargs=kwargs,
+        )

@@ -1,7 +1,7 @@
 """The state of N Tunnels, and the two things that happen to it: resets and steps."""
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from flowpolicy_envs.tunnel.config import TunnelConfig
 from flowpolicy_envs.tunnel.kernels import reset_batch, step_batch
@@ -72,6 +72,7 @@ class TunnelBatch:
             arcs: Where along the path, (N,); ignored for agents that are not chosen.
         """
         reset_batch(*self._path, arcs, chosen, self.positions, self._remaining, self.observations)
+        self.success[chosen] = False
 
     def step(self, actions: ArrayLike, active: np.ndarray | None = None) -> None:
         """Move agents and overwrite the arrays with the outcome.
@@ -93,3 +94,7 @@ class TunnelBatch:
         culprit = step_batch(*self._rules, moving, *self._state)
         if culprit >= 0:
             raise ValueError(f"actions must not contain NaN, got {given[culprit]} at {culprit}")
+
+    def infos(self) -> dict[str, NDArray]:
+        """Return what is known about the episodes: arrays (N,)."""
+        return {"is_success": self.success.copy()}

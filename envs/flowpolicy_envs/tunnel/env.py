@@ -7,9 +7,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowpolicy_envs.canvas import RENDER_FPS, RENDER_MODES, check_render_mode
 from flowpolicy_envs.tunnel.batch import TunnelBatch
 from flowpolicy_envs.tunnel.config import TunnelConfig
-from flowpolicy_envs.tunnel.rendering import RENDER_FPS, RENDER_MODES, Renderer, check_render_mode
+from flowpolicy_envs.tunnel.rendering import Renderer
 
 
 class TunnelEnv(gym.Env[np.ndarray, np.ndarray]):

@@ -1,0 +1,228 @@
+"""The arguments of a Square, checked once for the single and the vectorised environment."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from flowpolicy_envs.square import kernels
+from flowpolicy_envs.square.tasks import FindGoal, Task, as_task
+
+Range = float | Sequence[float]
+"""A number, or two: the ends of the interval from which each episode draws its own."""
+
+FEATURES: dict[str, slice] = {
+    "position": slice(0, 2),
+    "angle": slice(2, 4),
+    "fingers": slice(4, 12),
+    "action": slice(12, 20),
+    "timer": slice(20, 21),
+}
+"""What can be observed, and where in the complete observation it is."""
+
+DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+"""From the middle of the world to the fingers: right, top, left, bottom."""
+
+# Argument, column of the constants. All must be positive but those in _MAY_BE_ZERO.
+_CONSTANTS = {
+    "size": kernels.HALF_SIDE,
+    "mass": kernels.MASS,
+    "inertia": kernels.INERTIA,
+    "linear_damping": kernels.LINEAR_DAMPING,
+    "angular_damping": kernels.ANGULAR_DAMPING,
+    "friction": kernels.FRICTION,
+    "weight": kernels.WEIGHT,
+    "kp": kernels.STIFFNESS,
+    "max_force": kernels.MAX_FORCE,
+    "max_speed": kernels.MAX_SPEED,
+    "reach": kernels.REACH,
+}
+_MAY_BE_ZERO = ("linear_damping", "angular_damping", "friction", "weight", "kp")
+_POSE = ("start_x", "start_y", "start_angle")
+
+
+@dataclass(frozen=True, eq=False)
+class SquareConfig:
+    """Mechanics, task and observations of a Square. `SquareEnv` documents the arguments.
+
+    Raises:
+        ValueError: If an argument is outside of its range; the message names it.
+
+    Example:
+        >>> config = SquareConfig(mass=[0.2, 0.4])
+        >>> [round(config.draw(np.random.default_rng(k)).constants[1], 2) for k in (0, 1)]
+        [0.25, 0.39]
+        >>> SquareConfig(mass=-1.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: mass must be positive, got -1.0
+    """
+
+    task: Task | str = "hold"
+    size: Range = 0.6
+    mass: Range = 0.2
+    inertia: Range = 0.012
+    linear_damping: Range = 2.0
+    angular_damping: Range = 0.05
+    friction: Range = 0.5
+    weight: Range = 3.0
+    kp: Range = 25.0
+    kd: Range = 0.4
+    finger_damping: Range = 0.1
+    max_force: Range = 6.0
+    max_speed: Range = 1.0
+    reach: Range = 0.4
+    finger_distance: float = 0.4
+    finger_noise: float = 0.02
+    start_x: Range = (-0.03, 0.03)
+    start_y: Range = (-0.03, 0.03)
+    start_angle: Range = (-0.1, 0.1)
+    warm_up: float = 2.0
+    observe: Sequence[str] = tuple(FEATURES)
+    observation_noise: float | Mapping[str, float] = 0.0
+    stack: int = 2
+    dt: float = 0.01
+    substeps: int = 25
+    warm_steps: int = field(init=False, repr=False)
+    picked: NDArray[np.int64] = field(init=False, repr=False)
+    noise: NDArray[np.float64] = field(init=False, repr=False)
+    _ranges: dict[str, tuple[float, float]] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check the arguments and derive what follows from them."""
+        # The one way round a dataclass's own freeze.
+        object.__setattr__(self, "task", as_task(self.task))
+        names = (*_CONSTANTS, "kd", "finger_damping", *_POSE)
+        ranges = {name: _checked_range(name, getattr(self, name)) for name in names}
+        object.__setattr__(self, "_ranges", ranges)
+        for name in (*_CONSTANTS, "kd", "finger_damping"):
+            low = ranges[name][0]
+            zero = name in (*_MAY_BE_ZERO, "kd")
+            if low < 0.0 or (low == 0.0 and not zero):
+                least = "at least 0" if zero else "positive"
+                raise ValueError(f"{name} must be {least}, got {getattr(self, name)}")
+        for name in ("finger_distance", "finger_noise", "warm_up"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)}")
+        if not 0.0 < self.dt < math.inf:
+            raise ValueError(f"dt must be positive, got {self.dt}")
+        for name in ("stack", "substeps"):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+        self._check_stability()
+        # Rounded first: 2 s / 0.25 s must not become nine steps.
+        steps = math.ceil(round(self.warm_up / (self.dt * self.substeps), 9))
+        object.__setattr__(self, "warm_steps", steps)
+        object.__setattr__(self, "picked", _picked(self.observe))
+        noise = _noise(self.observation_noise)
+        object.__setattr__(self, "noise", noise[self.picked])
+
+    def _check_stability(self) -> None:
+        """Raise ValueError if a substep is too long for these constants."""
+        low, high = ({name: ends[k] for name, ends in self._ranges.items()} for k in (0, 1))
+        settling = self.dt * high["kp"] / (low["kd"] + low["finger_damping"])
+        if settling > 1.0:
+            raise ValueError(
+                f"dt * kp / (kd + finger_damping) must be at most 1 for the controller to settle, "
+                f"got {settling:.3g}"
+            )
+        # Of a corner, when pushed along a face's normal.
+        mobility = 1.0 / low["mass"] + (high["size"] / 2.0) ** 2 / low["inertia"]
+        drag = high["kd"] + high["finger_damping"]
+        coupling = kernels.FINGERS * self.dt * drag * mobility
+        if coupling > 0.5:
+            raise ValueError(
+                "4 * dt * (kd + finger_damping) * (1 / mass + (size / 2)**2 / inertia) must be at "
+                f"most 0.5 for the contact forces to converge, got {coupling:.3g}"
+            )
+        if self.dt * high["max_force"] * mobility > low["max_speed"]:
+            raise ValueError(
+                "dt * max_force * (1 / mass + (size / 2)**2 / inertia) must be at most max_speed, "
+                f"or fingers would overtake themselves: got {high['max_force'] * self.dt:.3g} * "
+                f"{mobility:.3g} > {low['max_speed']:.3g}"
+            )
+
+    @property
+    def frame_width(self) -> int:
+        """Number of features in one frame of the observation."""
+        return len(self.picked)
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """Box [-1, 1] of `stack` frames, the oldest first."""
+        return spaces.Box(-1.0, 1.0, (self.stack * self.frame_width,), np.float32)
+
+    @property
+    def action_space(self) -> spaces.Box:
+        """Box [-1, 1]^8."""
+        return spaces.Box(-1.0, 1.0, (kernels.ACTIONS,), np.float32)
+
+    def draw(self, rng: np.random.Generator) -> "Start":
+        """Draw what one episode starts with."""
+        drawn = {
+            name: low if low == high else float(rng.uniform(low, high))
+            for name, (low, high) in self._ranges.items()
+        }
+        constants = np.empty(kernels.N_CONSTANTS)
+        for name, column in _CONSTANTS.items():
+            constants[column] = drawn[name]
+        constants[kernels.HALF_SIDE] /= 2.0
+        constants[kernels.DRAG] = drawn["kd"] + drawn["finger_damping"]
+        starts = self.finger_distance * DIRECTIONS
+        if self.finger_noise > 0.0:
+            starts = starts + rng.uniform(-self.finger_noise, self.finger_noise, starts.shape)
+        goal = self.task.draw_goal(rng) if isinstance(self.task, FindGoal) else 0.0
+        return Start(constants, starts, np.array([drawn[name] for name in _POSE]), goal)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What was drawn for one episode.
+
+    Attributes:
+        constants: Physical constants, (12,).
+        fingers: Where the fingers start, (4, 2).
+        pose: Position and angle of the square, (3,).
+        goal: Both coordinates of the goal; 0 where there is none.
+    """
+
+    constants: NDArray[np.float64]
+    fingers: NDArray[np.float64]
+    pose: NDArray[np.float64]
+    goal: float
+
+
+def _checked_range(name: str, value: Range) -> tuple[float, float]:
+    """Return `value` as the ends of an interval."""
+    try:
+        ends = np.atleast_1d(np.asarray(value, np.float64))
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a number or [low, high], got {value!r}") from None
+    if ends.shape not in ((1,), (2,)) or not np.isfinite(ends).all() or ends[0] > ends[-1]:
+        raise ValueError(f"{name} must be a finite number or [low, high], got {value!r}")
+    return float(ends[0]), float(ends[-1])
+
+
+def _picked(observe: Sequence[str]) -> NDArray[np.int64]:
+    """Return which of the 21 features are observed."""
+    if isinstance(observe, str) or not observe or not set(observe) <= set(FEATURES):
+        raise ValueError(f"observe must name some of {tuple(FEATURES)}, got {observe!r}")
+    every = np.arange(kernels.N_FEATURES)
+    return np.concatenate([every[FEATURES[name]] for name in FEATURES if name in observe])
+
+
+def _noise(noise: float | Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the standard deviation of each of the 21 features' noise."""
+    by_name = noise if isinstance(noise, Mapping) else dict.fromkeys(FEATURES, noise)
+    scales = np.zeros(kernels.N_FEATURES)
+    for name, scale in by_name.items():
+        if name not in FEATURES:
+            raise ValueError(f"observation_noise must be for {tuple(FEATURES)}, got {name!r}")
+        if not 0.0 <= scale < math.inf:
+            raise ValueError(f"observation_noise must be finite and at least 0, got {scale}")
+        scales[FEATURES[name]] = scale
+    return scales

@@ -1,0 +1,486 @@
+"""Compiled mechanics, rewards and observations of the Square, for a batch of worlds at once.
+
+Contact is rigid. A finger has no mass and, in its viscous surroundings, pushes with the force F of
+its controller less what it needs to move itself: a finger whose tip moves with velocity v exerts
+F - c v. So the forces on the square follow from its own velocity, and no spring or impact law is
+needed: what contact does to the square's motion is push, or damp.
+
+All of it lives in one file on purpose: numba's cache notices changes only in the file of the
+function that is called.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+
+FINGERS = 4
+ACTIONS = 2 * FINGERS
+
+# Columns of `constants` (N, 12), which are drawn anew for each episode.
+HALF_SIDE, MASS, INERTIA, LINEAR_DAMPING, ANGULAR_DAMPING, FRICTION = range(6)
+WEIGHT, STIFFNESS, DRAG, MAX_FORCE, MAX_SPEED, REACH = range(6, 12)
+N_CONSTANTS = 12
+
+# Entries of `reward_terms` (11,), the task; see flowpolicy_envs.square.tasks.
+HELD, FAILURE, OVERREACH, SAFE_REACH, EFFORT, ANGLE = range(6)
+POSITION_BEFORE, POSITION_AFTER, Y_AFTER, GOAL, GOAL_RADIUS = range(6, 11)
+N_REWARD_TERMS = 11
+
+# Columns of `tallies` (N, 10): what the metrics of an episode are computed from.
+N_STEPS, N_HELD, N_AFTER, SUM_X, SUM_X2, MAX_X, SUM_R, SUM_R2, MAX_R, RETURN = range(10)
+N_TALLIES = 10
+
+# Columns of `metrics` (N, 5): what is told about an episode; names in flowpolicy_envs.square.batch.
+N_METRICS = 5
+
+# Values of `ends` (N,).
+GOING_ON, DROPPED, BROKEN = range(3)
+
+N_FEATURES = 4 + ACTIONS + ACTIONS + 1
+"""Position, cosine and sine of the angle, fingers, last action, timer."""
+
+N_SCRATCH = 10
+
+SWEEPS = 3
+"""How often contact forces are matched to the velocity they lead to. Each sweep makes the mismatch
+smaller by the factor that `SquareConfig` keeps below 1/2."""
+
+BREAKING = 1.02
+"""A finger breaks when it is pushed this far out, in units of its reach: a little more than 1, so
+that pressing against the edge of the reach is safe."""
+
+
+@njit(cache=True, inline="always")
+def _clip(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+@njit(cache=True)
+def substep(
+    dt: float,
+    constants: FloatArray,
+    targets: FloatArray,
+    body: FloatArray,
+    fingers: FloatArray,
+    scratch: FloatArray,
+    forces: FloatArray,
+) -> None:
+    """Advance one world by `dt` seconds, in place.
+
+    Args:
+        dt: Seconds.
+        constants: Physical constants, (12,).
+        targets: Where the controllers pull the fingers, (4, 2).
+        body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
+        fingers: Positions, (4, 2).
+        scratch: Room to work in, (4, 10).
+        forces: Overwritten by the contact forces on the square, (4, 4): normal (inwards) and
+            tangential force in N, then the same force along x and y.
+    """
+    half, mass, inertia = constants[HALF_SIDE], constants[MASS], constants[INERTIA]
+    drag, top_speed = constants[DRAG], constants[MAX_SPEED]
+    stiffness, max_force = constants[STIFFNESS], constants[MAX_FORCE]
+    friction = constants[FRICTION]
+    cos, sin = math.cos(body[2]), math.sin(body[2])
+    old_vx, old_vy, old_omega = body[3], body[4], body[5]
+    per_dt = 1.0 / dt
+
+    for i in range(FINGERS):
+        force_x = _clip(stiffness * (targets[i, 0] - fingers[i, 0]), -max_force, max_force)
+        force_y = _clip(stiffness * (targets[i, 1] - fingers[i, 1]), -max_force, max_force)
+        arm_x, arm_y = fingers[i, 0] - body[0], fingers[i, 1] - body[1]
+        local_x, local_y = cos * arm_x + sin * arm_y, cos * arm_y - sin * arm_x
+        # The nearest face, its inward normal, and the way to it (negative inside the square).
+        if abs(local_x) > abs(local_y):
+            sign = -1.0 if local_x > 0.0 else 1.0
+            normal_x, normal_y = sign * cos, sign * sin
+            gap, beside = abs(local_x) - half, abs(local_y) > half
+        else:
+            sign = -1.0 if local_y > 0.0 else 1.0
+            normal_x, normal_y = -sign * sin, sign * cos
+            gap, beside = abs(local_y) - half, abs(local_x) > half
+        lever = arm_x * normal_y - arm_y * normal_x
+        recede = normal_x * old_vx + normal_y * old_vy + lever * old_omega
+        # Speed at which the finger would just reach the face at the end of the substep.
+        closing = max(gap, 0.0) * per_dt
+        push = normal_x * force_x + normal_y * force_y
+        limit = 0.0
+        if not beside and closing + recede < top_speed and push > drag * (closing + recede):
+            # Fingers cannot be faster than their top speed, so neither can what they push. The
+            # force may at most bring the point of contact up to it within the substep.
+            mobility = 1.0 / mass + lever * lever / inertia
+            limit = (top_speed - recede - closing) * per_dt / mobility
+        scratch[i, 0], scratch[i, 1] = push, normal_x * force_y - normal_y * force_x
+        scratch[i, 2], scratch[i, 3] = normal_x, normal_y
+        scratch[i, 4] = lever
+        # Lever of the tangent (-normal_y, normal_x).
+        scratch[i, 5] = arm_x * normal_x + arm_y * normal_y
+        scratch[i, 6] = closing
+        scratch[i, 7] = limit
+        scratch[i, 8] = math.inf if beside else gap * per_dt
+
+    # Implicit: forces and the velocity they lead to are matched by iteration. All fingers are
+    # treated alike in each sweep, which keeps mirror images mirror images.
+    vx, vy, omega = old_vx, old_vy, old_omega
+    linear = 1.0 / (1.0 + dt * constants[LINEAR_DAMPING] / mass)
+    angular = 1.0 / (1.0 + dt * constants[ANGULAR_DAMPING] / inertia)
+    for _ in range(SWEEPS):
+        sum_x, sum_y, torque = 0.0, 0.0, 0.0
+        for i in range(FINGERS):
+            limit = scratch[i, 7]
+            if limit <= 0.0:
+                forces[i, 0], forces[i, 1] = 0.0, 0.0
+                forces[i, 2], forces[i, 3] = 0.0, 0.0
+                continue
+            normal_x, normal_y = scratch[i, 2], scratch[i, 3]
+            recede = normal_x * vx + normal_y * vy + scratch[i, 4] * omega
+            along = normal_x * vy - normal_y * vx + scratch[i, 5] * omega
+            press = _clip(scratch[i, 0] - drag * (recede + scratch[i, 6]), 0.0, limit)
+            rub = _clip(scratch[i, 1] - drag * along, -friction * press, friction * press)
+            forces[i, 0], forces[i, 1] = press, rub
+            forces[i, 2] = press * normal_x - rub * normal_y
+            forces[i, 3] = press * normal_y + rub * normal_x
+            sum_x += forces[i, 2]
+            sum_y += forces[i, 3]
+            torque += press * scratch[i, 4] + rub * scratch[i, 5]
+        vx = (old_vx + dt * sum_x / mass) * linear
+        vy = (old_vy + dt * sum_y / mass) * linear
+        omega = (old_omega + dt * torque / inertia) * angular
+
+    for i in range(FINGERS):
+        normal_x, normal_y = scratch[i, 2], scratch[i, 3]
+        push, pull = scratch[i, 0] / drag, scratch[i, 1] / drag
+        speed = math.sqrt(push * push + pull * pull)
+        if speed > top_speed:
+            push *= top_speed / speed
+            pull *= top_speed / speed
+        press, rub = forces[i, 0], forces[i, 1]
+        if press > 0.0:
+            pull = _clip((scratch[i, 1] - rub) / drag, -top_speed, top_speed)
+            if abs(rub) < friction * press:
+                pull = normal_x * vy - normal_y * vx + scratch[i, 5] * omega
+        # No finger may enter the square; one that is inside is put back on the face.
+        recede = normal_x * vx + normal_y * vy + scratch[i, 4] * omega
+        push = min(push, recede + scratch[i, 8])
+        fingers[i, 0] += dt * (push * normal_x - pull * normal_y)
+        fingers[i, 1] += dt * (push * normal_y + pull * normal_x)
+
+    body[3], body[4], body[5] = vx, vy, omega
+    for k in range(3):
+        body[k] += dt * body[3 + k]
+    # The world has walls for the middle of the square; none of the tasks comes near them.
+    for k in range(2):
+        if abs(body[k]) > 1.0:
+            body[k] = _clip(body[k], -1.0, 1.0)
+            body[3 + k] = 0.0
+
+
+@njit(cache=True)
+def _is_broken(fingers: FloatArray, starts: FloatArray, reach: float) -> bool:
+    farthest = 0.0
+    for i in range(FINGERS):
+        for k in range(2):
+            farthest = max(farthest, abs(fingers[i, k] - starts[i, k]))
+    return farthest > BREAKING * reach
+
+
+@njit(cache=True)
+def simulate(
+    dt: float,
+    substeps: int,
+    constants: FloatArray,
+    starts: FloatArray,
+    targets: FloatArray,
+    body: FloatArray,
+    fingers: FloatArray,
+    scratch: FloatArray,
+    forces: FloatArray,
+    presses: FloatArray,
+) -> bool:
+    """Advance one world by `substeps`, or until a finger breaks; return whether one did.
+
+    `presses` (4,) is overwritten by each finger's mean normal force in N.
+    """
+    presses[:] = 0.0
+    for k in range(substeps):
+        substep(dt, constants, targets, body, fingers, scratch, forces)
+        for i in range(FINGERS):
+            presses[i] += forces[i, 0]
+        if _is_broken(fingers, starts, constants[REACH]):
+            presses /= k + 1.0
+            return True
+    presses /= substeps
+    return False
+
+
+@njit(cache=True)
+def _observe(
+    timer: float,
+    constants: FloatArray,
+    starts: FloatArray,
+    actions: FloatArray,
+    body: FloatArray,
+    fingers: FloatArray,
+    picked: np.ndarray,
+    noise: FloatArray,
+    features: FloatArray,
+    frame: np.ndarray,
+) -> None:
+    """Write the `picked` (O,) features plus `noise` (O,) into `frame` (O,), within [-1, 1]."""
+    features[0], features[1] = body[0], body[1]
+    features[2], features[3] = math.cos(body[2]), math.sin(body[2])
+    for i in range(FINGERS):
+        for k in range(2):
+            features[4 + 2 * i + k] = (fingers[i, k] - starts[i, k]) / constants[REACH]
+    features[4 + ACTIONS : 4 + 2 * ACTIONS] = actions
+    features[4 + 2 * ACTIONS] = timer
+    for j in range(picked.shape[0]):
+        frame[j] = _clip(features[picked[j]] + noise[j], -1.0, 1.0)
+
+
+@njit(cache=True)
+def _reward(
+    terms: FloatArray,
+    held: bool,
+    failed: bool,
+    warm: bool,
+    constants: FloatArray,
+    targets: FloatArray,
+    actions: FloatArray,
+    body: FloatArray,
+    fingers: FloatArray,
+) -> float:
+    """Reward of a step, without the bonus for the goal."""
+    reward = 0.0
+    if held:
+        reward += terms[HELD]
+    if failed:
+        reward -= terms[FAILURE]
+    if terms[OVERREACH] > 0.0:
+        beyond = 0.0
+        for j in range(ACTIONS):
+            beyond += max(abs(actions[j]) - terms[SAFE_REACH], 0.0)
+        reward -= terms[OVERREACH] * beyond / (ACTIONS * (1.0 - terms[SAFE_REACH]))
+    if terms[EFFORT] > 0.0:
+        effort = 0.0
+        for i in range(FINGERS):
+            effort += math.sqrt(
+                (targets[i, 0] - fingers[i, 0]) ** 2 + (targets[i, 1] - fingers[i, 1]) ** 2
+            )
+        effort *= constants[STIFFNESS] / (FINGERS * constants[MAX_FORCE])
+        reward -= terms[EFFORT] * effort
+    distance = math.sqrt(body[0] ** 2 + body[1] ** 2)
+    reward -= terms[ANGLE] * abs(body[2])
+    if warm:
+        reward -= terms[POSITION_BEFORE] * distance
+    else:
+        reward -= terms[POSITION_AFTER] * distance + terms[Y_AFTER] * abs(body[1])
+    return reward
+
+
+@njit(cache=True)
+def _tally(held: bool, warm: bool, body: FloatArray, tallies: FloatArray) -> None:
+    tallies[N_STEPS] += 1.0
+    if held:
+        tallies[N_HELD] += 1.0
+    if warm:
+        return
+    x, r2 = body[0], body[0] ** 2 + body[1] ** 2
+    tallies[N_AFTER] += 1.0
+    tallies[SUM_X] += x
+    tallies[SUM_X2] += x * x
+    tallies[MAX_X] = max(tallies[MAX_X], abs(x))
+    tallies[SUM_R] += math.sqrt(r2)
+    tallies[SUM_R2] += r2
+    tallies[MAX_R] = max(tallies[MAX_R], math.sqrt(r2))
+
+
+@njit(cache=True)
+def _measure(tallies: FloatArray, metrics: FloatArray) -> None:
+    after = max(tallies[N_AFTER], 1.0)
+    metrics[0] = tallies[N_HELD] / max(tallies[N_STEPS], 1.0)
+    # Rounding can make the difference of two equal numbers negative.
+    metrics[1] = math.sqrt(max(tallies[SUM_X2] / after - (tallies[SUM_X] / after) ** 2, 0.0))
+    metrics[2] = tallies[MAX_X]
+    metrics[3] = math.sqrt(max(tallies[SUM_R2] / after - (tallies[SUM_R] / after) ** 2, 0.0))
+    metrics[4] = tallies[MAX_R]
+
+
+@njit(cache=True)
+def reset_batch(
+    chosen: np.ndarray,
+    picked: np.ndarray,
+    noise: FloatArray,
+    features: FloatArray,
+    constants: FloatArray,
+    starts: FloatArray,
+    bodies: FloatArray,
+    fingers: FloatArray,
+    targets: FloatArray,
+    actions: FloatArray,
+    presses: FloatArray,
+    tallies: FloatArray,
+    metrics: FloatArray,
+    held: np.ndarray,
+    found: np.ndarray,
+    success: np.ndarray,
+    ends: np.ndarray,
+    observations: np.ndarray,
+) -> None:
+    """Begin episodes in the `chosen` (N,) worlds, whose constants, starts and poses are set."""
+    width = picked.shape[0]
+    for n in range(chosen.shape[0]):
+        if not chosen[n]:
+            continue
+        bodies[n, 3:] = 0.0
+        fingers[n] = starts[n]
+        targets[n] = starts[n]
+        actions[n] = 0.0
+        presses[n] = 0.0
+        tallies[n] = 0.0
+        metrics[n] = 0.0
+        held[n] = False
+        found[n] = False
+        success[n] = False
+        ends[n] = GOING_ON
+        row = observations[n]
+        _observe(
+            1.0,
+            constants[n],
+            starts[n],
+            actions[n],
+            bodies[n],
+            fingers[n],
+            picked,
+            noise[n],
+            features,
+            row[:width],
+        )
+        for j in range(width, row.shape[0]):
+            row[j] = row[j - width]
+
+
+@njit(cache=True)
+def step_batch(
+    requests: FloatArray,
+    active: np.ndarray,
+    dt: float,
+    substeps: int,
+    warm_steps: float,
+    reward_terms: FloatArray,
+    goals: FloatArray,
+    scratch: FloatArray,
+    forces: FloatArray,
+    rewards: FloatArray,
+    terminated: np.ndarray,
+    picked: np.ndarray,
+    noise: FloatArray,
+    features: FloatArray,
+    constants: FloatArray,
+    starts: FloatArray,
+    bodies: FloatArray,
+    fingers: FloatArray,
+    targets: FloatArray,
+    actions: FloatArray,
+    presses: FloatArray,
+    tallies: FloatArray,
+    metrics: FloatArray,
+    held: np.ndarray,
+    found: np.ndarray,
+    success: np.ndarray,
+    ends: np.ndarray,
+    observations: np.ndarray,
+) -> int:
+    """Request targets `requests` (N, 8) in the `active` (N,) worlds and see what comes of it.
+
+    Inactive worlds stand still, earn nothing and do not terminate.
+
+    Returns:
+        -1, or the index of the first active world whose request contains NaN. In that case
+        nothing has been changed.
+    """
+    count, width = requests.shape[0], picked.shape[0]
+    for n in range(count):
+        if active[n]:
+            for j in range(ACTIONS):
+                if math.isnan(requests[n, j]):
+                    return n
+    for n in range(count):
+        rewards[n] = 0.0
+        terminated[n] = False
+        if not active[n]:
+            continue
+        reach = constants[n, REACH]
+        for i in range(FINGERS):
+            for k in range(2):
+                action = _clip(requests[n, 2 * i + k], -1.0, 1.0)
+                actions[n, 2 * i + k] = action
+                targets[n, i, k] = starts[n, i, k] + reach * action
+        broken = simulate(
+            dt,
+            substeps,
+            constants[n],
+            starts[n],
+            targets[n],
+            bodies[n],
+            fingers[n],
+            scratch,
+            forces,
+            presses[n],
+        )
+        press = 0.0
+        for i in range(FINGERS):
+            press += presses[n, i]
+        held[n] = constants[n, FRICTION] * press >= constants[n, WEIGHT]
+        # The timer that the agent saw before this step decides: it drops nothing before that is 0.
+        warm = tallies[n, N_STEPS] < warm_steps
+        _tally(held[n], warm, bodies[n], tallies[n])
+        if broken:
+            ends[n] = BROKEN
+        elif not (warm or held[n]):
+            ends[n] = DROPPED
+        terminated[n] = ends[n] != GOING_ON
+        rewards[n] = _reward(
+            reward_terms,
+            held[n],
+            terminated[n],
+            warm,
+            constants[n],
+            targets[n],
+            actions[n],
+            bodies[n],
+            fingers[n],
+        )
+        _measure(tallies[n], metrics[n])
+        searching = not (warm or terminated[n] or found[n])
+        if reward_terms[GOAL_RADIUS] > 0.0:
+            off_x, off_y = bodies[n, 0] - goals[n, 0], bodies[n, 1] - goals[n, 1]
+            if searching and off_x * off_x + off_y * off_y <= reward_terms[GOAL_RADIUS] ** 2:
+                found[n] = True
+                rewards[n] += reward_terms[GOAL]
+            success[n] = found[n]
+        else:
+            success[n] = searching
+        tallies[n, RETURN] += rewards[n]
+        row = observations[n]
+        for j in range(row.shape[0] - width):
+            row[j] = row[j + width]
+        timer = 0.0
+        if tallies[n, N_STEPS] < warm_steps:
+            timer = 1.0 - tallies[n, N_STEPS] / warm_steps
+        _observe(
+            timer,
+            constants[n],
+            starts[n],
+            actions[n],
+            bodies[n],
+            fingers[n],
+            picked,
+            noise[n],
+            features,
+            row[row.shape[0] - width :],
+        )
+    return -1

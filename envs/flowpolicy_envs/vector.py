@@ -1,0 +1,235 @@
+"""What the vectorised environments have in common: seeds, time limits, resets and infos."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from flowpolicy_envs.canvas import RENDER_FPS, check_render_mode
+
+BoolArray = NDArray[np.bool_]
+StepResult = tuple[NDArray[np.float32], NDArray[np.float64], BoolArray, BoolArray, dict[str, Any]]
+
+
+class Batch(Protocol):
+    """The state of N agents. Each call of `step` overwrites the arrays (N, ...)."""
+
+    observations: NDArray[np.float32]
+    rewards: NDArray[np.float64]
+    terminated: BoolArray
+
+    def infos(self) -> dict[str, NDArray[Any]]:
+        """Return new arrays (N,): what each agent's `info` holds."""
+
+
+class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndarray]):
+    """N agents of the same kind, each with its own random generator.
+
+    A subclass says how agents begin an episode, how they step, and what they look like.
+
+    Args:
+        batch: The agents' state.
+        observation_space: Of one agent.
+        action_space: Of one agent.
+        num_envs: Number of agents N, at least 1.
+        max_episode_steps: Steps after which an episode is truncated, at least 1, or None for
+            never.
+        autoreset_mode: What follows an episode's end.
+        render_mode: None or "rgb_array".
+        render_fps: Frames per second at which pictures show real time.
+
+    Raises:
+        ValueError: If an argument is outside of its range; the message names it.
+    """
+
+    def __init__(
+        self,
+        batch: Batch,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        *,
+        num_envs: int,
+        max_episode_steps: int | None,
+        autoreset_mode: str | AutoresetMode,
+        render_mode: str | None,
+        render_fps: int = RENDER_FPS,
+    ) -> None:
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be None or >= 1, got {max_episode_steps}")
+        check_render_mode(render_mode, ("rgb_array",))
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space = observation_space
+        self.single_action_space = action_space
+        self.observation_space = batch_space(observation_space, num_envs)
+        self.action_space = batch_space(action_space, num_envs)
+        self._agents = batch
+        self._everyone = np.ones(num_envs, np.bool_)
+        self._limit = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
+        self._steps = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)
+        self._seeds: list[int | None] = [None] * num_envs
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+
+    @abstractmethod
+    def _begin(self, chosen: BoolArray) -> None:
+        """Put the `chosen` (N,) agents at the start of a new episode."""
+
+    @abstractmethod
+    def _advance(self, actions: ArrayLike, active: BoolArray | None) -> None:
+        """Step the `active` (N,) agents, None for all."""
+
+    @abstractmethod
+    def _frame(self, i: int) -> NDArray[np.uint8]:
+        """Return agent i's picture."""
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The agents' random generators."""
+        return tuple(self._generator(i) for i in range(self.num_envs))
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seeds of the agents' random generators."""
+        self.np_random  # noqa: B018 (makes those that do not exist yet)
+        return tuple(self._seeds)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: One seed per agent, or an integer s for s, s + 1, ..., or None to go on with
+                the generators as they are.
+            options: `{"reset_mask": mask}` restricts the reset to the agents in the boolean
+                `mask` (N,), as "Disabled" needs it.
+
+        Raises:
+            ValueError: If the number of seeds or the mask does not fit the number of agents.
+        """
+        seeds = self._checked_seeds(seed)
+        chosen = self._checked_mask((options or {}).get("reset_mask"))
+        for i in np.flatnonzero(chosen).tolist():
+            if seeds[i] is not None:
+                self._generators[i], self._seeds[i] = seeding.np_random(seeds[i])
+        self._restart(chosen)
+        return self._agents.observations.copy(), _masked(self._agents.infos(), chosen)
+
+    def step(self, actions: ArrayLike) -> StepResult:
+        """Move every agent by its action, and reset as `autoreset_mode` says.
+
+        Args:
+            actions: Actions (N, D); clipped to [-1, 1].
+
+        Returns:
+            Observations (N, O), rewards (N,), terminations (N,), truncations (N,) and infos.
+
+        Raises:
+            ValueError: If `actions` has another shape or an action contains NaN.
+            ResetNeeded: If an episode has ended and `autoreset_mode` is "Disabled".
+        """
+        agents, mode = self._agents, self.autoreset_mode
+        ended = self._ended
+        anyone_ended = bool(ended.any())
+        if anyone_ended and mode is AutoresetMode.DISABLED:
+            raise ResetNeeded(
+                f"autoreset_mode is Disabled, so agents {np.flatnonzero(ended).tolist()} must be "
+                f"reset before the next step"
+            )
+        self._advance(actions, ~ended if anyone_ended else None)
+        self._steps += 1
+        if anyone_ended:
+            self._restart(ended)
+        rewards, terminated = agents.rewards.copy(), agents.terminated.copy()
+        truncated = self._steps >= self._limit
+        np.logical_or(terminated, truncated, out=self._ended)
+        final = {}
+        if mode is AutoresetMode.SAME_STEP and self._ended.any():
+            final = self._final_infos(self._ended)
+            self._restart(self._ended)
+        infos = {**final, **_masked(agents.infos(), self._everyone)}
+        return agents.observations.copy(), rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a frame (render_size, render_size, 3) per agent."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._frame(i) for i in range(self.num_envs))
+
+    def _restart(self, chosen: BoolArray) -> None:
+        self._begin(chosen)
+        self._steps[chosen] = 0
+        self._ended[chosen] = False
+
+    def _final_infos(self, ended: BoolArray) -> dict[str, Any]:
+        """Describe how episodes ended, the way `SyncVectorEnv` does."""
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        observations = self._agents.observations.copy()
+        for i in np.flatnonzero(ended).tolist():
+            final_obs[i] = observations[i]
+        return {
+            "final_obs": final_obs,
+            "_final_obs": ended.copy(),
+            "final_info": _masked(self._agents.infos(), ended),
+            "_final_info": ended.copy(),
+        }
+
+    def _generator(self, i: int) -> np.random.Generator:
+        generator = self._generators[i]
+        if generator is None:
+            generator, self._seeds[i] = seeding.np_random()
+            self._generators[i] = generator
+        return generator
+
+    def _checked_seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed must have one entry per agent, {self.num_envs}, got {seed}")
+        return list(seed)
+
+    def _checked_mask(self, mask: Any) -> BoolArray:
+        if mask is None:
+            return self._everyone
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ValueError(
+                f"options['reset_mask'] must be boolean of shape ({self.num_envs},) with at "
+                f"least one True, got {mask}"
+            )
+        return mask
+
+
+def check_num_envs(num_envs: int) -> int:
+    """Return `num_envs`, or raise ValueError if it is no number of agents."""
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ValueError(f"num_envs must be an integer of at least 1, got {num_envs!r}")
+    return int(num_envs)
+
+
+def _masked(infos: dict[str, NDArray[Any]], mask: BoolArray) -> dict[str, Any]:
+    """Pair each array with `mask` under its name with an underscore, and blank out the rest."""
+    masked: dict[str, Any] = {}
+    for name, values in infos.items():
+        values[~mask] = None if values.dtype == np.object_ else 0
+        masked[name], masked[f"_{name}"] = values, mask.copy()
+    return masked
