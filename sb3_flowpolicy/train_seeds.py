@@ -37,12 +37,19 @@ def main(arguments: list[str] | None = None) -> None:
         batch, done = _new_batch(args, folder), 0
     total = args.n_timesteps or load_hyperparameters(args.algo, args.env)["n_timesteps"]
     print(f"{args.algo} on {args.env}, seeds {batch.seeds}: {total - done} steps each", flush=True)
-    batch.learn(
-        max(total - done, 0),
-        tb_log_name=f"{args.algo}_{args.env}",
-        reset_num_timesteps=not args.resume,
-        progress_bar=args.progress,
-    )
+    while done < total:
+        stage = min(args.eval_freq or total, total - done)
+        batch.learn(
+            stage,
+            tb_log_name=f"{args.algo}_{args.env}",
+            reset_num_timesteps=not done,
+            progress_bar=args.progress,
+        )
+        done += stage
+        if args.eval_freq:
+            returns = _test_returns(batch, args.env, args.eval_episodes)
+            _append(folder / "evaluations.csv", batch.seeds, done, returns)
+            print(f"  step {done:<8} test return {np.mean(returns):8.2f}", flush=True)
     batch.save(folder)
     _report(batch, args.env, args.eval_episodes)
     print(f"Saved to {folder}")
@@ -73,16 +80,40 @@ def _overrides(pairs: list[str]) -> dict[str, Any]:
     return settings
 
 
+def _test_returns(batch: SeedBatch, env_id: str, n_episodes: int) -> np.ndarray:
+    """Return each seed's deterministic returns, (S, n_episodes), on the same episodes."""
+    returns = []
+    for model in batch.models:
+        env = make_vec_env(env_id, seed=0)
+        rewards, _ = evaluate_policy(model, env, n_episodes, return_episode_rewards=True)
+        returns.append(rewards)
+        env.close()
+    return np.asarray(returns)
+
+
+def _append(path: Path, seeds: list[int], step: int, returns: np.ndarray) -> None:
+    """Append a row per seed to the file of evaluations."""
+    rows = [
+        f"{seed},{step},{row.mean():.6g},{row.std():.6g}\n"
+        for seed, row in zip(seeds, returns, strict=True)
+    ]
+    known = path.read_text() if path.exists() else "seed,step,test_return,std\n"
+    # Written whole, then renamed: an interrupted run leaves no half rows.
+    draft = path.with_suffix(".tmp")
+    draft.write_text(known + "".join(rows))
+    draft.replace(path)
+
+
 def _report(batch: SeedBatch, env_id: str, n_episodes: int) -> None:
     """Print the test return of each seed, the best and the worst alike."""
-    env = make_vec_env(env_id, seed=0)
-    means = []
-    for seed, model in zip(batch.seeds, batch.models, strict=True):
-        mean, std = evaluate_policy(model, env, n_episodes)
-        means.append(mean)
-        print(f"  seed {seed:<4} test return {mean:8.2f} +/- {std:.2f} ({n_episodes} episodes)")
+    returns = _test_returns(batch, env_id, n_episodes)
+    for seed, row in zip(batch.seeds, returns, strict=True):
+        print(
+            f"  seed {seed:<4} test return {row.mean():8.2f} +/- {row.std():.2f} "
+            f"({n_episodes} episodes)"
+        )
+    means = returns.mean(axis=1)
     print(f"  all       test return {np.mean(means):8.2f} +/- {np.std(means):.2f} over seeds")
-    env.close()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -102,6 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     add("-f", "--log-folder", default="logs", help="where to save agents and monitor files")
     add("-tb", "--tensorboard-log", help="TensorBoard folder, one run per seed")
     add("--eval-episodes", type=int, default=20, help="test episodes per seed at the end")
+    add("--eval-freq", type=int, help="steps between tests, written to evaluations.csv")
     add("--num-threads", type=int, default=1, help="torch threads; small networks like one best")
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--resume", action="store_true", help="go on with the saved batch, up to n-timesteps")

@@ -229,7 +229,9 @@ def check_num_envs(num_envs: int) -> int:
 def _masked(infos: dict[str, NDArray[Any]], mask: BoolArray) -> dict[str, Any]:
     """Pair each array with `mask` under its name with an underscore, and blank out the rest."""
     masked: dict[str, Any] = {}
+    blank = None if mask.all() else ~mask
     for name, values in infos.items():
-        values[~mask] = None if values.dtype == np.object_ else 0
+        if blank is not None:
+            values[blank] = None if values.dtype == np.object_ else 0
         masked[name], masked[f"_{name}"] = values, mask.copy()
     return masked

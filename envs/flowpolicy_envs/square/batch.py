@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.config import SquareConfig
+from flowpolicy_envs.square.tasks import as_task
 
 METRICS = ("held_fraction", "x_std", "x_max", "distance_std", "distance_max")
 END_REASONS = np.array(["timeout", "dropped", "broken"], dtype=object)
@@ -68,6 +69,8 @@ class SquareBatch:
         self.found = np.zeros(count, dtype=np.bool_)
         self.success = np.zeros(count, dtype=np.bool_)
         self.ends = np.zeros(count, dtype=np.int64)
+        self._uniform = np.zeros((count, kernels.N_SETUP))
+        self._setup_ends = config.setup_ends
         self._noise = np.zeros((count, config.frame_width))
         self._requests = np.zeros((count, kernels.ACTIONS))
         # Collected once: building these tuples anew would cost as much as the step itself.
@@ -94,7 +97,7 @@ class SquareBatch:
             float(config.dt),
             int(config.substeps),
             float(config.warm_steps),
-            config.task.terms(),
+            as_task(config.task).terms(),
             self.goals,
             np.zeros((kernels.FINGERS, kernels.N_SCRATCH)),
             np.zeros((kernels.FINGERS, 4)),
@@ -111,13 +114,9 @@ class SquareBatch:
             generators: Function from the number of a world to its random generator.
         """
         for n in np.flatnonzero(chosen).tolist():
-            start = self.config.draw(generators(n))
-            self.constants[n] = start.constants
-            self.starts[n] = start.fingers
-            self.bodies[n, :3] = start.pose
-            self.goals[n] = start.goal
+            generators(n).random(out=self._uniform[n])
         self._draw_noise(chosen, generators)
-        kernels.reset_batch(chosen, *self._seen)
+        kernels.reset_batch(chosen, self._uniform, *self._setup_ends, self.goals, *self._seen)
 
     def step(
         self,

@@ -36,11 +36,12 @@ _CONSTANTS = {
     "friction": kernels.FRICTION,
     "weight": kernels.WEIGHT,
     "kp": kernels.STIFFNESS,
+    "finger_damping": kernels.DRAG,
     "max_force": kernels.MAX_FORCE,
     "max_speed": kernels.MAX_SPEED,
     "reach": kernels.REACH,
 }
-_MAY_BE_ZERO = ("linear_damping", "angular_damping", "friction", "weight", "kp")
+_MAY_BE_ZERO = ("linear_damping", "angular_damping", "friction", "weight", "kp", "kd")
 _POSE = ("start_x", "start_y", "start_angle")
 
 
@@ -52,9 +53,8 @@ class SquareConfig:
         ValueError: If an argument is outside of its range; the message names it.
 
     Example:
-        >>> config = SquareConfig(mass=[0.2, 0.4])
-        >>> [round(config.draw(np.random.default_rng(k)).constants[1], 2) for k in (0, 1)]
-        [0.25, 0.39]
+        >>> SquareConfig(stack=3).observation_space.shape
+        (63,)
         >>> SquareConfig(mass=-1.0)
         Traceback (most recent call last):
         ...
@@ -95,12 +95,12 @@ class SquareConfig:
         """Check the arguments and derive what follows from them."""
         # The one way round a dataclass's own freeze.
         object.__setattr__(self, "task", as_task(self.task))
-        names = (*_CONSTANTS, "kd", "finger_damping", *_POSE)
+        names = (*_CONSTANTS, "kd", *_POSE)
         ranges = {name: _checked_range(name, getattr(self, name)) for name in names}
         object.__setattr__(self, "_ranges", ranges)
-        for name in (*_CONSTANTS, "kd", "finger_damping"):
+        for name in (*_CONSTANTS, "kd"):
             low = ranges[name][0]
-            zero = name in (*_MAY_BE_ZERO, "kd")
+            zero = name in _MAY_BE_ZERO
             if low < 0.0 or (low == 0.0 and not zero):
                 least = "at least 0" if zero else "positive"
                 raise ValueError(f"{name} must be {least}, got {getattr(self, name)}")
@@ -161,39 +161,21 @@ class SquareConfig:
         """Box [-1, 1]^8."""
         return spaces.Box(-1.0, 1.0, (kernels.ACTIONS,), np.float32)
 
-    def draw(self, rng: np.random.Generator) -> "Start":
-        """Draw what one episode starts with."""
-        drawn = {
-            name: low if low == high else float(rng.uniform(low, high))
-            for name, (low, high) in self._ranges.items()
-        }
-        constants = np.empty(kernels.N_CONSTANTS)
+    @property
+    def setup_ends(self) -> NDArray[np.float64]:
+        """The least and the greatest setup of an episode, (2, 25), named in `square.kernels`."""
+        ends = np.zeros((2, kernels.N_SETUP))
         for name, column in _CONSTANTS.items():
-            constants[column] = drawn[name]
-        constants[kernels.HALF_SIDE] /= 2.0
-        constants[kernels.DRAG] = drawn["kd"] + drawn["finger_damping"]
-        starts = self.finger_distance * DIRECTIONS
-        if self.finger_noise > 0.0:
-            starts = starts + rng.uniform(-self.finger_noise, self.finger_noise, starts.shape)
-        goal = self.task.draw_goal(rng) if isinstance(self.task, FindGoal) else 0.0
-        return Start(constants, starts, np.array([drawn[name] for name in _POSE]), goal)
-
-
-@dataclass(frozen=True)
-class Start:
-    """What was drawn for one episode.
-
-    Attributes:
-        constants: Physical constants, (12,).
-        fingers: Where the fingers start, (4, 2).
-        pose: Position and angle of the square, (3,).
-        goal: Both coordinates of the goal; 0 where there is none.
-    """
-
-    constants: NDArray[np.float64]
-    fingers: NDArray[np.float64]
-    pose: NDArray[np.float64]
-    goal: float
+            ends[:, column] = self._ranges[name]
+        ends[:, kernels.HALF_SIDE] /= 2.0
+        ends[:, kernels.KD] = self._ranges["kd"]
+        ends[:, kernels.POSE] = np.transpose([self._ranges[name] for name in _POSE])
+        ends[:, kernels.PLACES] = self.finger_distance * DIRECTIONS.ravel()
+        ends[0, kernels.PLACES] -= self.finger_noise
+        ends[1, kernels.PLACES] += self.finger_noise
+        if isinstance(self.task, FindGoal):
+            ends[:, kernels.GOAL_AT] = -self.task.span, self.task.span
+        return ends
 
 
 def _checked_range(name: str, value: Range) -> tuple[float, float]:

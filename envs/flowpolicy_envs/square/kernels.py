@@ -24,6 +24,11 @@ HALF_SIDE, MASS, INERTIA, LINEAR_DAMPING, ANGULAR_DAMPING, FRICTION = range(6)
 WEIGHT, STIFFNESS, DRAG, MAX_FORCE, MAX_SPEED, REACH = range(6, 12)
 N_CONSTANTS = 12
 
+# What an episode begins with (25,): the constants, with the fingers' own damping for the drag,
+# then these.
+KD, POSE, PLACES, GOAL_AT = 12, slice(13, 16), slice(16, 24), 24
+N_SETUP = 25
+
 # Entries of `reward_terms` (11,), the task; see flowpolicy_envs.square.tasks.
 HELD, FAILURE, OVERREACH, SAFE_REACH, EFFORT, ANGLE = range(6)
 POSITION_BEFORE, POSITION_AFTER, Y_AFTER, GOAL, GOAL_RADIUS = range(6, 11)
@@ -42,7 +47,13 @@ GOING_ON, DROPPED, BROKEN = range(3)
 N_FEATURES = 4 + ACTIONS + ACTIONS + 1
 """Position, cosine and sine of the angle, fingers, last action, timer."""
 
-N_SCRATCH = 10
+# What a substep notes about each finger: force of its controller along normal and tangent, the
+# normal, both levers, speeds, and the force that the contact can take.
+_PUSH, _PULL, _NORMAL_X, _NORMAL_Y, _LEVER, _TANGENT_LEVER, _CLOSING, _LIMIT, _ROOM = range(9)
+N_SCRATCH = 9
+
+_STANDSTILL = 1e-30
+"""Units or radians per second."""
 
 SWEEPS = 3
 """How often contact forces are matched to the velocity they lead to. Each sweep makes the mismatch
@@ -53,12 +64,16 @@ BREAKING = 1.02
 that pressing against the edge of the reach is safe."""
 
 
-@njit(cache=True, inline="always")
+# Python's error model would check each division for zero; `SquareConfig` has excluded that.
+_compiled = njit(cache=True, error_model="numpy")
+
+
+@_compiled
 def _clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
-@njit(cache=True)
+@_compiled
 def substep(
     dt: float,
     constants: FloatArray,
@@ -76,109 +91,114 @@ def substep(
         targets: Where the controllers pull the fingers, (4, 2).
         body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
         fingers: Positions, (4, 2).
-        scratch: Room to work in, (4, 10).
+        scratch: Room to work in, (4, 9).
         forces: Overwritten by the contact forces on the square, (4, 4): normal (inwards) and
             tangential force in N, then the same force along x and y.
     """
-    half, mass, inertia = constants[HALF_SIDE], constants[MASS], constants[INERTIA]
-    drag, top_speed = constants[DRAG], constants[MAX_SPEED]
+    half, drag, top_speed = constants[HALF_SIDE], constants[DRAG], constants[MAX_SPEED]
     stiffness, max_force = constants[STIFFNESS], constants[MAX_FORCE]
     friction = constants[FRICTION]
+    per_dt, per_mass, per_inertia = 1.0 / dt, 1.0 / constants[MASS], 1.0 / constants[INERTIA]
+    x, y = body[0], body[1]
     cos, sin = math.cos(body[2]), math.sin(body[2])
     old_vx, old_vy, old_omega = body[3], body[4], body[5]
-    per_dt = 1.0 / dt
 
+    touching = False
     for i in range(FINGERS):
         force_x = _clip(stiffness * (targets[i, 0] - fingers[i, 0]), -max_force, max_force)
         force_y = _clip(stiffness * (targets[i, 1] - fingers[i, 1]), -max_force, max_force)
-        arm_x, arm_y = fingers[i, 0] - body[0], fingers[i, 1] - body[1]
+        arm_x, arm_y = fingers[i, 0] - x, fingers[i, 1] - y
         local_x, local_y = cos * arm_x + sin * arm_y, cos * arm_y - sin * arm_x
         # The nearest face, its inward normal, and the way to it (negative inside the square).
         if abs(local_x) > abs(local_y):
-            sign = -1.0 if local_x > 0.0 else 1.0
+            sign = math.copysign(1.0, -local_x)
             normal_x, normal_y = sign * cos, sign * sin
             gap, beside = abs(local_x) - half, abs(local_y) > half
         else:
-            sign = -1.0 if local_y > 0.0 else 1.0
+            sign = math.copysign(1.0, -local_y)
             normal_x, normal_y = -sign * sin, sign * cos
             gap, beside = abs(local_y) - half, abs(local_x) > half
         lever = arm_x * normal_y - arm_y * normal_x
-        recede = normal_x * old_vx + normal_y * old_vy + lever * old_omega
-        # Speed at which the finger would just reach the face at the end of the substep.
-        closing = max(gap, 0.0) * per_dt
         push = normal_x * force_x + normal_y * force_y
-        limit = 0.0
-        if not beside and closing + recede < top_speed and push > drag * (closing + recede):
-            # Fingers cannot be faster than their top speed, so neither can what they push. The
-            # force may at most bring the point of contact up to it within the substep.
-            mobility = 1.0 / mass + lever * lever / inertia
-            limit = (top_speed - recede - closing) * per_dt / mobility
-        scratch[i, 0], scratch[i, 1] = push, normal_x * force_y - normal_y * force_x
-        scratch[i, 2], scratch[i, 3] = normal_x, normal_y
-        scratch[i, 4] = lever
-        # Lever of the tangent (-normal_y, normal_x).
-        scratch[i, 5] = arm_x * normal_x + arm_y * normal_y
-        scratch[i, 6] = closing
-        scratch[i, 7] = limit
-        scratch[i, 8] = math.inf if beside else gap * per_dt
+        # Speed at which the finger reaches the face at the end of the substep.
+        closing = max(gap, 0.0) * per_dt
+        limit, room = 0.0, math.inf
+        if not beside:
+            room = gap * per_dt
+            needed = closing + normal_x * old_vx + normal_y * old_vy + lever * old_omega
+            if needed < top_speed and push > drag * needed:
+                # A finger is not faster than its top speed, so neither is what it pushes: within
+                # the substep its force may bring the point of contact up to it, not beyond.
+                limit = (top_speed - needed) * per_dt / (per_mass + lever * lever * per_inertia)
+                touching = True
+        scratch[i, _PUSH], scratch[i, _PULL] = push, normal_x * force_y - normal_y * force_x
+        scratch[i, _NORMAL_X], scratch[i, _NORMAL_Y] = normal_x, normal_y
+        scratch[i, _LEVER] = lever
+        # The tangent is the normal, turned left.
+        scratch[i, _TANGENT_LEVER] = arm_x * normal_x + arm_y * normal_y
+        scratch[i, _CLOSING], scratch[i, _LIMIT], scratch[i, _ROOM] = closing, limit, room
+        forces[i, 0], forces[i, 1], forces[i, 2], forces[i, 3] = 0.0, 0.0, 0.0, 0.0
 
     # Implicit: forces and the velocity they lead to are matched by iteration. All fingers are
     # treated alike in each sweep, which keeps mirror images mirror images.
+    linear = 1.0 / (1.0 + dt * constants[LINEAR_DAMPING] * per_mass)
+    angular = 1.0 / (1.0 + dt * constants[ANGULAR_DAMPING] * per_inertia)
     vx, vy, omega = old_vx, old_vy, old_omega
-    linear = 1.0 / (1.0 + dt * constants[LINEAR_DAMPING] / mass)
-    angular = 1.0 / (1.0 + dt * constants[ANGULAR_DAMPING] / inertia)
-    for _ in range(SWEEPS):
+    for _ in range(SWEEPS if touching else 1):
         sum_x, sum_y, torque = 0.0, 0.0, 0.0
         for i in range(FINGERS):
-            limit = scratch[i, 7]
+            limit = scratch[i, _LIMIT]
             if limit <= 0.0:
-                forces[i, 0], forces[i, 1] = 0.0, 0.0
-                forces[i, 2], forces[i, 3] = 0.0, 0.0
                 continue
-            normal_x, normal_y = scratch[i, 2], scratch[i, 3]
-            recede = normal_x * vx + normal_y * vy + scratch[i, 4] * omega
-            along = normal_x * vy - normal_y * vx + scratch[i, 5] * omega
-            press = _clip(scratch[i, 0] - drag * (recede + scratch[i, 6]), 0.0, limit)
-            rub = _clip(scratch[i, 1] - drag * along, -friction * press, friction * press)
+            normal_x, normal_y = scratch[i, _NORMAL_X], scratch[i, _NORMAL_Y]
+            lever, tangent_lever = scratch[i, _LEVER], scratch[i, _TANGENT_LEVER]
+            recede = normal_x * vx + normal_y * vy + lever * omega
+            along = normal_x * vy - normal_y * vx + tangent_lever * omega
+            press = scratch[i, _PUSH] - drag * (recede + scratch[i, _CLOSING])
+            press = _clip(press, 0.0, limit)
+            rub = scratch[i, _PULL] - drag * along
+            rub = _clip(rub, -friction * press, friction * press)
             forces[i, 0], forces[i, 1] = press, rub
             forces[i, 2] = press * normal_x - rub * normal_y
             forces[i, 3] = press * normal_y + rub * normal_x
             sum_x += forces[i, 2]
             sum_y += forces[i, 3]
-            torque += press * scratch[i, 4] + rub * scratch[i, 5]
-        vx = (old_vx + dt * sum_x / mass) * linear
-        vy = (old_vy + dt * sum_y / mass) * linear
-        omega = (old_omega + dt * torque / inertia) * angular
+            torque += press * lever + rub * tangent_lever
+        vx = (old_vx + dt * per_mass * sum_x) * linear
+        vy = (old_vy + dt * per_mass * sum_y) * linear
+        omega = (old_omega + dt * per_inertia * torque) * angular
 
     for i in range(FINGERS):
-        normal_x, normal_y = scratch[i, 2], scratch[i, 3]
-        push, pull = scratch[i, 0] / drag, scratch[i, 1] / drag
-        speed = math.sqrt(push * push + pull * pull)
-        if speed > top_speed:
-            push *= top_speed / speed
-            pull *= top_speed / speed
+        normal_x, normal_y = scratch[i, _NORMAL_X], scratch[i, _NORMAL_Y]
+        push, pull = scratch[i, _PUSH] / drag, scratch[i, _PULL] / drag
+        speed2 = push * push + pull * pull
+        if speed2 > top_speed * top_speed:
+            share = top_speed / math.sqrt(speed2)
+            push *= share
+            pull *= share
         press, rub = forces[i, 0], forces[i, 1]
         if press > 0.0:
-            pull = _clip((scratch[i, 1] - rub) / drag, -top_speed, top_speed)
             if abs(rub) < friction * press:
-                pull = normal_x * vy - normal_y * vx + scratch[i, 5] * omega
+                pull = normal_x * vy - normal_y * vx + scratch[i, _TANGENT_LEVER] * omega
+            else:
+                pull = _clip((scratch[i, _PULL] - rub) / drag, -top_speed, top_speed)
         # No finger may enter the square; one that is inside is put back on the face.
-        recede = normal_x * vx + normal_y * vy + scratch[i, 4] * omega
-        push = min(push, recede + scratch[i, 8])
+        recede = normal_x * vx + normal_y * vy + scratch[i, _LEVER] * omega
+        push = min(push, recede + scratch[i, _ROOM])
         fingers[i, 0] += dt * (push * normal_x - pull * normal_y)
         fingers[i, 1] += dt * (push * normal_y + pull * normal_x)
 
-    body[3], body[4], body[5] = vx, vy, omega
-    for k in range(3):
-        body[k] += dt * body[3 + k]
-    # The world has walls for the middle of the square; none of the tasks comes near them.
-    for k in range(2):
-        if abs(body[k]) > 1.0:
-            body[k] = _clip(body[k], -1.0, 1.0)
-            body[3 + k] = 0.0
+    # A square that nobody touches would creep on with ever smaller, ever slower to compute numbers.
+    body[3] = vx if abs(vx) > _STANDSTILL else 0.0
+    body[4] = vy if abs(vy) > _STANDSTILL else 0.0
+    body[5] = omega if abs(omega) > _STANDSTILL else 0.0
+    # The world has walls for the middle of the square; no task comes near them.
+    body[0] = _clip(x + dt * body[3], -1.0, 1.0)
+    body[1] = _clip(y + dt * body[4], -1.0, 1.0)
+    body[2] += dt * body[5]
 
 
-@njit(cache=True)
+@_compiled
 def _is_broken(fingers: FloatArray, starts: FloatArray, reach: float) -> bool:
     farthest = 0.0
     for i in range(FINGERS):
@@ -187,7 +207,7 @@ def _is_broken(fingers: FloatArray, starts: FloatArray, reach: float) -> bool:
     return farthest > BREAKING * reach
 
 
-@njit(cache=True)
+@_compiled
 def simulate(
     dt: float,
     substeps: int,
@@ -216,7 +236,7 @@ def simulate(
     return False
 
 
-@njit(cache=True)
+@_compiled
 def _observe(
     timer: float,
     constants: FloatArray,
@@ -241,7 +261,7 @@ def _observe(
         frame[j] = _clip(features[picked[j]] + noise[j], -1.0, 1.0)
 
 
-@njit(cache=True)
+@_compiled
 def _reward(
     terms: FloatArray,
     held: bool,
@@ -281,7 +301,7 @@ def _reward(
     return reward
 
 
-@njit(cache=True)
+@_compiled
 def _tally(held: bool, warm: bool, body: FloatArray, tallies: FloatArray) -> None:
     tallies[N_STEPS] += 1.0
     if held:
@@ -298,7 +318,7 @@ def _tally(held: bool, warm: bool, body: FloatArray, tallies: FloatArray) -> Non
     tallies[MAX_R] = max(tallies[MAX_R], math.sqrt(r2))
 
 
-@njit(cache=True)
+@_compiled
 def _measure(tallies: FloatArray, metrics: FloatArray) -> None:
     after = max(tallies[N_AFTER], 1.0)
     metrics[0] = tallies[N_HELD] / max(tallies[N_STEPS], 1.0)
@@ -309,9 +329,13 @@ def _measure(tallies: FloatArray, metrics: FloatArray) -> None:
     metrics[4] = tallies[MAX_R]
 
 
-@njit(cache=True)
+@_compiled
 def reset_batch(
     chosen: np.ndarray,
+    uniform: FloatArray,
+    least: FloatArray,
+    most: FloatArray,
+    goals: FloatArray,
     picked: np.ndarray,
     noise: FloatArray,
     features: FloatArray,
@@ -330,12 +354,21 @@ def reset_batch(
     ends: np.ndarray,
     observations: np.ndarray,
 ) -> None:
-    """Begin episodes in the `chosen` (N,) worlds, whose constants, starts and poses are set."""
+    """Begin episodes in the `chosen` (N,) worlds.
+
+    Their setups lie between `least` and `most` (25,), where `uniform` (N, 25) in [0, 1) says.
+    """
     width = picked.shape[0]
     for n in range(chosen.shape[0]):
         if not chosen[n]:
             continue
+        setup = least + uniform[n] * (most - least)
+        constants[n] = setup[:N_CONSTANTS]
+        constants[n, DRAG] += setup[KD]
+        bodies[n, :3] = setup[POSE]
         bodies[n, 3:] = 0.0
+        starts[n] = setup[PLACES].reshape(FINGERS, 2)
+        goals[n] = setup[GOAL_AT]
         fingers[n] = starts[n]
         targets[n] = starts[n]
         actions[n] = 0.0
@@ -363,7 +396,7 @@ def reset_batch(
             row[j] = row[j - width]
 
 
-@njit(cache=True)
+@_compiled
 def step_batch(
     requests: FloatArray,
     active: np.ndarray,

@@ -129,7 +129,7 @@ class Renderer(Canvas):
         line = self._pixels(0.006)
         for k, colour in enumerate(COLOURS):
             corner = (starts[k] - reach).round()
-            box = pygame.Rect(*corner, round(2 * reach), round(2 * reach))
+            box = pygame.Rect(corner[0], corner[1], round(2 * reach), round(2 * reach))
             pygame.draw.rect(canvas, colour, box, width=line)
         for k, colour in enumerate(COLOURS):
             pygame.draw.circle(canvas, (255, 255, 255), targets[k], self._pixels(0.022))

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,6 @@ class Task:
     held: float = 1.0
     failure: float = 10.0
     angle: float = 0.0
-
-    has_goal: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the coefficients."""
@@ -133,8 +130,6 @@ class FindGoal(Move):
     radius: float = 0.06
     span: float = 0.25
 
-    has_goal: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
         """Check the coefficients."""
         super().__post_init__()
@@ -149,10 +144,6 @@ class FindGoal(Move):
         terms[kernels.GOAL] = self.goal
         terms[kernels.GOAL_RADIUS] = self.radius
         return terms
-
-    def draw_goal(self, rng: np.random.Generator) -> float:
-        """Return u."""
-        return float(rng.uniform(-self.span, self.span))
 
 
 TASKS: dict[str, type[Task]] = {
