@@ -12,9 +12,22 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from flowpolicy_envs.registration import TUNNEL_IDS
+from flowpolicy_envs.registration import SQUARE_IDS, TUNNEL_IDS
 
-IDS = list(TUNNEL_IDS)
+IDS = [*TUNNEL_IDS, *SQUARE_IDS]
+RANDOM = {
+    **{key: {"start_noise": 0.1} for key in TUNNEL_IDS},
+    **{key: {"observation_noise": 0.01} for key in SQUARE_IDS},
+}
+"""Arguments with which episodes differ."""
+FIXED = {
+    **{key: {} for key in TUNNEL_IDS},
+    **{
+        key: {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0}
+        for key in SQUARE_IDS
+    },
+}
+"""Arguments with which they are alike."""
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -46,7 +59,7 @@ def rollout(env: gym.Env, steps: int, rng: np.random.Generator) -> list[tuple]:
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("env_id", IDS)
 def test_copies_go_on_alike_and_independently(env_id, clone):
-    env = gym.make(env_id, start_noise=0.1, render_mode="rgb_array", render_size=32)
+    env = gym.make(env_id, **RANDOM[env_id], render_mode="rgb_array", render_size=32)
     env.reset(seed=3)
     rollout(env, 10, np.random.default_rng(0))
     env.render()
@@ -57,7 +70,7 @@ def test_copies_go_on_alike_and_independently(env_id, clone):
 
 
 def fingerprint(env_id: str) -> str:
-    env = gym.make(env_id, start_noise=0.1)
+    env = gym.make(env_id, **RANDOM[env_id])
     observation, _ = env.reset(seed=7)
     outcomes = rollout(env, 200, np.random.default_rng(7))
     return hashlib.sha256(repr((observation.tobytes(), outcomes)).encode()).hexdigest()
@@ -72,13 +85,13 @@ def test_another_process_sees_the_same_numbers():
     command = [sys.executable, "-c", program, __file__, *IDS]
     run = subprocess.run(command, capture_output=True, check=True, text=True)
     assert run.stdout.split() == [fingerprint(env_id) for env_id in IDS]
-    # Tunnel-v0 is the diagonal by default; all others differ.
-    assert len(set(run.stdout.split())) == len(IDS) - 1
+    # Tunnel-v0 is the diagonal and Square-v0 the holding task by default; all others differ.
+    assert len(set(run.stdout.split())) == len(IDS) - 2
 
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_seeds_matter_only_with_a_random_start(env_id):
-    for noise in (0.0, 0.1):
-        env = gym.make(env_id, start_noise=noise)
+    for arguments, n_starts in ((FIXED[env_id], 1), (RANDOM[env_id], 5)):
+        env = gym.make(env_id, **arguments)
         starts = {env.reset(seed=seed)[0].tobytes() for seed in range(5)}
-        assert len(starts) == (5 if noise else 1)
+        assert len(starts) == n_starts

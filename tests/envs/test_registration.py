@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 
 import flowpolicy_envs
-from flowpolicy_envs.registration import TUNNEL_IDS
+from flowpolicy_envs.registration import SQUARE_IDS, TUNNEL_IDS
 
 EXPECTED = {
     # id: path, coupled dims, reach / width, dense, goal, penalty
@@ -19,8 +19,29 @@ EXPECTED = {
 }
 
 
+EXPECTED_SQUARES = {
+    # id: task, force limit, seconds of warm-up, steps
+    "Square-v0": ("Hold", 6.0, 2.0, 40),
+    "SquareHold-v0": ("Hold", 6.0, 2.0, 40),
+    "SquareMove-v0": ("Move", 1.95, 4.0, 80),
+    "SquareMoveX-v0": ("MoveX", 1.95, 4.0, 80),
+    "SquareFindGoal-v0": ("FindGoal", 1.95, 4.0, 80),
+}
+
+
 def test_every_id_is_listed():
     assert set(TUNNEL_IDS) == {*EXPECTED, "Tunnel-v0"}
+    assert set(SQUARE_IDS) == set(EXPECTED_SQUARES)
+
+
+@pytest.mark.parametrize("env_id", EXPECTED_SQUARES)
+def test_square_ids_have_the_documented_rules(env_id):
+    env = gym.make(env_id)
+    config = env.unwrapped.config
+    assert env.observation_space.shape == (42,)
+    assert env.spec is not None
+    rules = (type(config.task).__name__, config.max_force, config.warm_up)
+    assert (*rules, env.spec.max_episode_steps) == EXPECTED_SQUARES[env_id]
 
 
 @pytest.mark.parametrize("env_id", EXPECTED)
@@ -65,19 +86,20 @@ def test_registering_again_is_silent_and_keeps_the_registration():
 
 
 def test_public_names_resolve():
-    assert flowpolicy_envs.TunnelEnv.__name__ == "TunnelEnv"
-    assert flowpolicy_envs.TunnelVectorEnv.__name__ == "TunnelVectorEnv"
+    for name in flowpolicy_envs.__all__:
+        assert getattr(flowpolicy_envs, name).__name__ == name
     with pytest.raises(AttributeError, match="has no attribute 'Tunnel'"):
         flowpolicy_envs.Tunnel  # noqa: B018
 
 
-def test_importing_is_light_and_making_an_environment_needs_no_torch():
+@pytest.mark.parametrize("env_id", ["TunnelDiagonal-v0", "SquareHold-v0"])
+def test_importing_is_light_and_making_an_environment_needs_no_torch(env_id):
     program = (
         "import sys, json, flowpolicy_envs, gymnasium as gym\n"
         "heavy = lambda: [m for m in ('torch', 'stable_baselines3', 'sb3_flowpolicy', 'numba',"
         " 'pygame') if m in sys.modules]\n"
         "first = heavy()\n"
-        "env = gym.make('TunnelDiagonal-v0')\n"
+        f"env = gym.make('{env_id}')\n"
         "env.reset()\n"
         "env.step(env.action_space.sample())\n"
         "print(json.dumps([first, heavy()]))"
