@@ -48,9 +48,10 @@ N_FEATURES = 4 + ACTIONS + ACTIONS + 1
 """Position, cosine and sine of the angle, fingers, last action, timer."""
 
 # What a substep notes about each finger: force of its controller along normal and tangent, the
-# normal, both levers, speeds, and the force that the contact can take.
-_PUSH, _PULL, _NORMAL_X, _NORMAL_Y, _LEVER, _TANGENT_LEVER, _CLOSING, _LIMIT, _ROOM = range(9)
-N_SCRATCH = 9
+# normal, both levers, share of the substep in contact, room to move, and bounds of the forces.
+_PUSH, _PULL, _NORMAL_X, _NORMAL_Y, _LEVER, _TANGENT_LEVER, _SHARE, _ROOM = range(8)
+_LIMIT, _LEAST_RUB, _MOST_RUB = range(8, 11)
+N_SCRATCH = 11
 
 _STANDSTILL = 1e-30
 """Units or radians per second."""
@@ -91,7 +92,7 @@ def substep(
         targets: Where the controllers pull the fingers, (4, 2).
         body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
         fingers: Positions, (4, 2).
-        scratch: Room to work in, (4, 9).
+        scratch: Room to work in, (4, 11).
         forces: Overwritten by the contact forces on the square, (4, 4): normal (inwards) and
             tangential force in N, then the same force along x and y.
     """
@@ -119,24 +120,33 @@ def substep(
             normal_x, normal_y = -sign * sin, sign * cos
             gap, beside = abs(local_y) - half, abs(local_x) > half
         lever = arm_x * normal_y - arm_y * normal_x
+        # The tangent is the normal, turned left.
+        tangent_lever = arm_x * normal_x + arm_y * normal_y
         push = normal_x * force_x + normal_y * force_y
-        # Speed at which the finger reaches the face at the end of the substep.
         closing = max(gap, 0.0) * per_dt
-        limit, room = 0.0, math.inf
+        share, limit, room = 0.0, 0.0, math.inf
         if not beside:
-            room = gap * per_dt
-            needed = closing + normal_x * old_vx + normal_y * old_vy + lever * old_omega
-            if needed < top_speed and push > drag * needed:
-                # A finger is not faster than its top speed, so neither is what it pushes: within
-                # the substep its force may bring the point of contact up to it, not beyond.
-                limit = (top_speed - needed) * per_dt / (per_mass + lever * lever * per_inertia)
+            # A finger that slipped in at a corner is put back on the face if its controller agrees.
+            # Against the controller that would cost energy which nobody has paid.
+            room = gap * per_dt if gap > 0.0 or push <= 0.0 else 0.0
+            recede = normal_x * old_vx + normal_y * old_vy + lever * old_omega
+            approach = _clip(push / drag, -top_speed, top_speed) - recede
+            if approach > closing:
                 touching = True
+                # One that is still on its way presses for the rest of the substep only.
+                share = 1.0 - closing / approach
+                # A finger is not faster than its top speed, so neither is what it pushes or drags:
+                # within the substep its force may bring the point of contact up to it, not beyond.
+                inert = per_dt / (per_mass + lever * lever * per_inertia)
+                limit = max(top_speed - recede - closing, 0.0) * inert
+                along = normal_x * old_vy - normal_y * old_vx + tangent_lever * old_omega
+                inert = per_dt / (per_mass + tangent_lever * tangent_lever * per_inertia)
+                scratch[i, _LEAST_RUB] = min(-top_speed - along, 0.0) * inert
+                scratch[i, _MOST_RUB] = max(top_speed - along, 0.0) * inert
         scratch[i, _PUSH], scratch[i, _PULL] = push, normal_x * force_y - normal_y * force_x
         scratch[i, _NORMAL_X], scratch[i, _NORMAL_Y] = normal_x, normal_y
-        scratch[i, _LEVER] = lever
-        # The tangent is the normal, turned left.
-        scratch[i, _TANGENT_LEVER] = arm_x * normal_x + arm_y * normal_y
-        scratch[i, _CLOSING], scratch[i, _LIMIT], scratch[i, _ROOM] = closing, limit, room
+        scratch[i, _LEVER], scratch[i, _TANGENT_LEVER] = lever, tangent_lever
+        scratch[i, _SHARE], scratch[i, _LIMIT], scratch[i, _ROOM] = share, limit, room
         forces[i, 0], forces[i, 1], forces[i, 2], forces[i, 3] = 0.0, 0.0, 0.0, 0.0
 
     # Implicit: forces and the velocity they lead to are matched by iteration. All fingers are
@@ -154,9 +164,10 @@ def substep(
             lever, tangent_lever = scratch[i, _LEVER], scratch[i, _TANGENT_LEVER]
             recede = normal_x * vx + normal_y * vy + lever * omega
             along = normal_x * vy - normal_y * vx + tangent_lever * omega
-            press = scratch[i, _PUSH] - drag * (recede + scratch[i, _CLOSING])
+            press = scratch[i, _SHARE] * (scratch[i, _PUSH] - drag * recede)
             press = _clip(press, 0.0, limit)
             rub = scratch[i, _PULL] - drag * along
+            rub = _clip(rub, scratch[i, _LEAST_RUB], scratch[i, _MOST_RUB])
             rub = _clip(rub, -friction * press, friction * press)
             forces[i, 0], forces[i, 1] = press, rub
             forces[i, 2] = press * normal_x - rub * normal_y
