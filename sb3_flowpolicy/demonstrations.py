@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv
 
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
 
@@ -54,6 +56,61 @@ def record_demonstrations(
             column.append(value)
         obs = env.reset()[0] if terminated or truncated else next_obs
     return {key: np.asarray(column) for key, column in columns.items()}
+
+
+def is_recipe(source: Any) -> bool:
+    """Return whether this says how to record demonstrations, instead of being some."""
+    return isinstance(source, Mapping) and "controller" in source
+
+
+def follow_recipe(
+    recipe: Mapping[str, Any], env: VecEnv, seed: int | None = None
+) -> dict[str, np.ndarray]:
+    """Record demonstrations in a fresh environment like the first of ``env``.
+
+    Args:
+        recipe: ``controller``: function from an observation to an action, or the import path of a
+            class or function that makes one, such as ``flowpolicy_envs.Holder``, with its
+            arguments under ``controller_kwargs``; ``n_steps``: number of transitions. Plain enough
+            for a YAML file.
+        env: Environments that were made from registered ids.
+        seed: Seed of the first reset.
+
+    Returns:
+        The arrays of :func:`record_demonstrations`.
+
+    Raises:
+        ValueError: If the recipe is not of this form, or the environment has no id.
+
+    Example:
+        >>> import flowpolicy_envs
+        >>> from stable_baselines3.common.env_util import make_vec_env
+        >>> recipe = {"controller": "flowpolicy_envs.Holder", "n_steps": 80}
+        >>> demos = follow_recipe(recipe, make_vec_env("SquareMove-v0"), seed=0)
+        >>> bool(demos["truncations"][-1]), demos["actions"].shape
+        (True, (80, 8))
+    """
+    known = {"controller", "controller_kwargs", "n_steps"}
+    if set(recipe) - known or "n_steps" not in recipe:
+        raise ValueError(f"demonstrations must have the keys {sorted(known)}, got {sorted(recipe)}")
+    controller = recipe["controller"]
+    if isinstance(controller, str):
+        module, _, name = controller.rpartition(".")
+        try:
+            factory = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(
+                f"controller must be the import path of a class or function, got {controller!r}"
+            ) from error
+        controller = factory(**recipe.get("controller_kwargs", {}))
+    spec = env.get_attr("spec")[0]
+    if spec is None:
+        raise ValueError("demonstrations can be recorded only in environments made from an id")
+    fresh = gym.make(spec, render_mode=None)
+    try:
+        return record_demonstrations(fresh, controller, recipe["n_steps"], seed)
+    finally:
+        fresh.close()
 
 
 def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -18,7 +18,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFr
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.demonstrations import fill_replay_buffer, load_demonstrations
+from sb3_flowpolicy.demonstrations import (
+    fill_replay_buffer,
+    follow_recipe,
+    is_recipe,
+    load_demonstrations,
+)
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
 from sb3_flowpolicy.policies.sac import check_finite_actions
 
@@ -47,7 +52,9 @@ class SACFlow(SAC):
             Default: ``learning_starts``, as in SB3, where one number decides both when random
             actions end and when updates begin (thesis: "initial random steps", "update after").
         demonstrations: Transitions to put into the replay buffer before learning, as an
-            ``.npz`` file or as arrays; see :meth:`add_demonstrations`.
+            ``.npz`` file or as arrays; see :meth:`add_demonstrations`. Or how to record them,
+            ``{"controller": "flowpolicy_envs.Holder", "n_steps": 4000}``; see
+            :func:`~sb3_flowpolicy.demonstrations.follow_recipe`.
         critic_loss_coef: Factor of the critics' summed mean squared error, above 0: 0.5 as in
             SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels but for
             weight decay, which weighs half as much at 1.0.
@@ -94,7 +101,7 @@ class SACFlow(SAC):
         env: GymEnv | str,
         *sac_args: Any,
         random_steps: int | None = None,
-        demonstrations: str | Path | Mapping[str, np.ndarray] | None = None,
+        demonstrations: str | Path | Mapping[str, Any] | None = None,
         critic_loss_coef: float = SB3_CRITIC_LOSS_COEF,
         compile: bool | Literal["auto"] = "auto",
         autocast: bool = False,
@@ -113,8 +120,10 @@ class SACFlow(SAC):
         self._worth_compiling = False
         self._engine: Engine | None = None
         self._engine_refused = False
-        self._demonstrations = (
-            None if demonstrations is None else load_demonstrations(demonstrations)
+        self._demonstrations: Any = (
+            demonstrations
+            if demonstrations is None or is_recipe(demonstrations)
+            else load_demonstrations(demonstrations)
         )
         try:
             super().__init__(policy, env, *sac_args, **sac_kwargs)
@@ -153,6 +162,10 @@ class SACFlow(SAC):
     ) -> tuple[int, BaseCallback]:
         # Here and not at construction: a model that is loaded to act needs no demonstrations.
         if self._demonstrations is not None:
+            if is_recipe(self._demonstrations):
+                assert self.env is not None
+                recorded = follow_recipe(self._demonstrations, self.env, self.seed)
+                self._demonstrations = recorded
             self.add_demonstrations(self._demonstrations)
             self._demonstrations = None
         total_timesteps, callback = super()._setup_learn(

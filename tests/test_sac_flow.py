@@ -204,3 +204,26 @@ def test_stock_sac_models_load() -> None:
     assert np.array_equal(
         ours.predict(obs, deterministic=True)[0], stock.predict(obs, deterministic=True)[0]
     )
+
+
+def test_demonstrations_may_be_a_recipe() -> None:
+    recipe = {"controller": "flowpolicy_envs.Holder", "n_steps": 90}
+    model = SACFlow("FlowPolicy", "SquareMove-v0", demonstrations=recipe, seed=3, **FAST)
+    model.learn(5)
+    buffer = model.replay_buffer
+    assert buffer is not None
+    assert buffer.pos == 95
+    assert buffer.actions[0, 0] == pytest.approx([-0.65, 0, 0, -0.65, 0.65, 0, 0, 0.65])
+    # The second episode starts where the first was truncated.
+    assert buffer.timeouts[79, 0]
+    with pytest.raises(ValueError, match="controller must be the import path .* 'nowhere.Nobody'"):
+        SACFlow(
+            "FlowPolicy",
+            "SquareMove-v0",
+            demonstrations={"controller": "nowhere.Nobody", "n_steps": 9},
+            **FAST,
+        ).learn(1)
+    with pytest.raises(ValueError, match="demonstrations must have the keys .*got"):
+        SACFlow("FlowPolicy", "SquareMove-v0", demonstrations={"controller": "a.b"}, **FAST).learn(
+            1
+        )

@@ -15,19 +15,11 @@ from gymnasium.utils.env_checker import check_env
 from flowpolicy_envs.registration import SQUARE_IDS, TUNNEL_IDS
 
 IDS = [*TUNNEL_IDS, *SQUARE_IDS]
-RANDOM = {
-    **{key: {"start_noise": 0.1} for key in TUNNEL_IDS},
-    **{key: {"observation_noise": 0.01} for key in SQUARE_IDS},
-}
-"""Arguments with which episodes differ."""
-FIXED = {
-    **{key: {} for key in TUNNEL_IDS},
-    **{
-        key: {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0}
-        for key in SQUARE_IDS
-    },
-}
-"""Arguments with which they are alike."""
+STILL = {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0}
+NOISY = {"observation_noise": 0.01}
+# Arguments with which episodes differ, and with which they are alike.
+RANDOM = {**{i: {"start_noise": 0.1} for i in TUNNEL_IDS}, **dict.fromkeys(SQUARE_IDS, NOISY)}
+FIXED = {**{i: {} for i in TUNNEL_IDS}, **dict.fromkeys(SQUARE_IDS, STILL)}
 
 
 @pytest.mark.parametrize("env_id", IDS)

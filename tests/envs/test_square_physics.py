@@ -129,7 +129,7 @@ def test_a_finger_feels_what_it_does():
         velocity = (world.fingers - old) / DT
         residual = controller - world.forces[:, 2:] - drag * velocity
         # At its top speed a finger has force to spare, and on arrival only a part of the substep.
-        slow = (world.forces[:, 0] > 0.0) & (np.abs(velocity).max(axis=1) < 0.3) & (gaps < 1e-3)
+        slow = (world.forces[:, 0] > 0.0) & (np.abs(velocity).max(axis=1) < 0.3) & (gaps < 1e-6)
         assert np.abs(residual[slow]).max(initial=0.0) < 0.05
         checked += int(slow.sum())
     assert checked > 200

@@ -13,21 +13,14 @@ COUNT, STEPS = 5, 120
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
 # With these, episodes end in all the ways they can: the Tunnel's by leaving, goal and time limit,
 # the Square's by dropping and time limit (fingers break too rarely to count on it).
-ARGUMENTS = {
-    **{
-        key: {"start_noise": 0.4, "width": 0.2, "max_episode_steps": 7, "dense_reward": 1.0}
-        for key in TUNNEL_IDS
-    },
-    **{
-        key: {
-            "weight": [1.0, 3.0],
-            "warm_up": 0.6,
-            "max_episode_steps": 5,
-            "observation_noise": {"position": 0.01, "angle": 0.1},
-        }
-        for key in SQUARE_IDS
-    },
+TUNNEL = {"start_noise": 0.4, "width": 0.2, "max_episode_steps": 7, "dense_reward": 1.0}
+SQUARE = {
+    "weight": [1.0, 3.0],
+    "warm_up": 0.6,
+    "max_episode_steps": 5,
+    "observation_noise": {"position": 0.01, "angle": 0.1},
 }
+ARGUMENTS = {**dict.fromkeys(TUNNEL_IDS, TUNNEL), **dict.fromkeys(SQUARE_IDS, SQUARE)}
 
 
 def make_pair(env_id: str, mode: AutoresetMode, **kwargs: Any) -> tuple[VectorEnv, VectorEnv]:
