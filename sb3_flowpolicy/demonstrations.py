@@ -106,7 +106,9 @@ def follow_recipe(
     spec = env.get_attr("spec")[0]
     if spec is None:
         raise ValueError("demonstrations can be recorded only in environments made from an id")
-    fresh = gym.make(spec, render_mode=None)
+    # Without the wrappers around it, such as SB3's Monitor, which would count these episodes.
+    kwargs = {**spec.kwargs, "render_mode": None}
+    fresh = gym.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
     try:
         return record_demonstrations(fresh, controller, recipe["n_steps"], seed)
     finally:

@@ -17,6 +17,7 @@ FLOORS = [
     "policies",
     "engine",
     "demonstrations",
+    "vec_env",
     "sac_flow",
     "seed_episodes",
     "seed_setup",

@@ -15,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
 from stable_baselines3.common.logger import configure
 
+import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.demonstrations import load_demonstrations, record_demonstrations
 
@@ -208,7 +209,7 @@ def test_stock_sac_models_load() -> None:
 
 def test_demonstrations_may_be_a_recipe() -> None:
     recipe = {"controller": "flowpolicy_envs.Holder", "n_steps": 90}
-    model = SACFlow("FlowPolicy", "SquareMove-v0", demonstrations=recipe, seed=3, **FAST)
+    model = SACFlow("FlowPolicy", "SquareMove-v0", demonstrations=recipe, **FAST)
     model.learn(5)
     buffer = model.replay_buffer
     assert buffer is not None
@@ -216,14 +217,14 @@ def test_demonstrations_may_be_a_recipe() -> None:
     assert buffer.actions[0, 0] == pytest.approx([-0.65, 0, 0, -0.65, 0.65, 0, 0, 0.65])
     # The second episode starts where the first was truncated.
     assert buffer.timeouts[79, 0]
-    with pytest.raises(ValueError, match="controller must be the import path .* 'nowhere.Nobody'"):
+    with pytest.raises(ValueError, match=r"controller must be the import path .* 'nowhere.Nobody'"):
         SACFlow(
             "FlowPolicy",
             "SquareMove-v0",
             demonstrations={"controller": "nowhere.Nobody", "n_steps": 9},
             **FAST,
         ).learn(1)
-    with pytest.raises(ValueError, match="demonstrations must have the keys .*got"):
+    with pytest.raises(ValueError, match=r"demonstrations must have the keys .*got"):
         SACFlow("FlowPolicy", "SquareMove-v0", demonstrations={"controller": "a.b"}, **FAST).learn(
             1
         )

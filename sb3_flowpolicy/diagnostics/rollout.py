@@ -10,6 +10,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.diagnostics.film import episode_frames
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,19 +68,7 @@ def rollout_figure(
     Raises:
         ValueError: If there is more than one environment, or it cannot show action samples.
     """
-    if env.num_envs != 1:
-        raise ValueError(f"env must hold one environment, got {env.num_envs}")
-    if not hasattr(env, "get_attr") or not env.has_attr("set_action_samples"):
-        raise ValueError("env must have a method set_action_samples, got none")
-    frames = []
-    obs, done = env.reset(), np.array([False])
-    while not done[0]:
-        assert isinstance(obs, np.ndarray)
-        samples, _ = model.predict(np.repeat(obs, n_samples, axis=0))
-        env.env_method("set_action_samples", samples)
-        frames.append(env.render(mode="rgb_array"))
-        action, _ = model.predict(obs, deterministic=True)
-        obs, _, done, _ = env.step(action)
+    frames = episode_frames(model, env, n_samples, deterministic=True)
     chosen = np.unique(np.linspace(0, len(frames) - 1, n_panels).round().astype(int))
     figure = new_figure(3.2 * len(chosen), 3.4)
     for axes, step in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):

@@ -1,0 +1,142 @@
+"""Environments with a batched form of their own, as SB3's VecEnv."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+
+def make_batched_env(
+    env_id: str, n_envs: int = 1, seed: int | None = None, **env_kwargs: Any
+) -> VecMonitor:
+    """Make many environments that one compiled call steps, for any SB3 algorithm.
+
+    Args:
+        env_id: Id of an environment that brings a vectorised form, as all of ``flowpolicy_envs``.
+        n_envs: Number of environments, at least 1.
+        seed: Seed of the first; the others get those after it.
+        **env_kwargs: Arguments of the environment.
+
+    Returns:
+        The environments, with SB3's record of episodes around them.
+
+    Raises:
+        ValueError: If the environment has no vectorised form.
+
+    Example:
+        >>> import flowpolicy_envs
+        >>> env = make_batched_env("SquareHold-v0", n_envs=3, seed=1)
+        >>> env.reset().shape
+        (3, 42)
+    """
+    if gym.spec(env_id).vector_entry_point is None:
+        raise ValueError(f"env_id must have a vectorised form, got {env_id!r}")
+    venv = gym.make_vec(
+        env_id,
+        num_envs=n_envs,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        **env_kwargs,
+    )
+    batched = BatchedVecEnv(venv)
+    batched.seed(seed)
+    return VecMonitor(batched)
+
+
+class BatchedVecEnv(VecEnv):
+    """Translates gymnasium's ``VectorEnv`` to SB3's ``VecEnv``.
+
+    Args:
+        venv: Vectorised environment with array observations that resets in the same step.
+
+    Raises:
+        ValueError: If it resets at another time.
+    """
+
+    def __init__(self, venv: VectorEnv) -> None:
+        mode = venv.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"venv must reset in the same step, got autoreset_mode {mode}")
+        self.venv = venv
+        self._actions: np.ndarray | None = None
+        space, actions = venv.single_observation_space, venv.single_action_space
+        assert isinstance(space, spaces.Space)
+        super().__init__(venv.num_envs, space, actions)
+
+    def reset(self) -> np.ndarray:
+        """Reset all environments and return their observations, (N, ...)."""
+        seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
+        obs, infos = self.venv.reset(seed=seeds)  # type: ignore[arg-type]
+        self.reset_infos = [_of(infos, i) for i in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Note the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Take the step."""
+        assert self._actions is not None
+        obs, rewards, terminated, truncated, batch = self.venv.step(self._actions)
+        dones = terminated | truncated
+        infos = []
+        for i in range(self.num_envs):
+            if dones[i]:
+                info = _of(batch["final_info"], i)
+                info["terminal_observation"] = batch["final_obs"][i]
+                self.reset_infos[i] = _of(batch, i)
+            else:
+                info = _of(batch, i)
+            info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+            infos.append(info)
+        return obs, np.asarray(rewards, np.float32), dones, infos
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.venv.close()
+
+    def get_images(self) -> list[np.ndarray | None]:
+        """Return a picture of each environment."""
+        images: Any = self.venv.render()
+        return list(images or [None] * self.num_envs)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Return whether the environments have an attribute."""
+        return hasattr(self.venv, attr_name)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return what the batch calls so, for each environment."""
+        return [getattr(self.venv, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Raise ``NotImplementedError``: the environments share their attributes."""
+        raise NotImplementedError(f"batched environments share {attr_name}: make them anew")
+
+    def env_method(
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        """Raise ``NotImplementedError``: there are no single environments to call."""
+        raise NotImplementedError(f"batched environments cannot call {method_name} one by one")
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """Return whether environments are wrapped: they are not."""
+        return [False for _ in self._get_indices(indices)]
+
+
+def _of(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """Return one environment's part of a batch's infos."""
+    return {
+        name: values[i].item() if isinstance(values[i], np.generic) else values[i]
+        for name, values in infos.items()
+        if not name.startswith("_") and name not in ("final_obs", "final_info")
+    }

@@ -1,0 +1,53 @@
+"""`python -m sb3_flowpolicy.zoo.film`: a video and a sequence of pictures of a trained model."""
+
+import argparse
+from pathlib import Path
+
+from sb3_flowpolicy.diagnostics.film import episode_frames, sequence_figure, write_video
+from sb3_flowpolicy.zoo.saved_run import add_run_arguments, load_run
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Film the model that the command line names.
+
+    Args:
+        arguments: Command line without the program's name. Default: that of the process.
+
+    Raises:
+        ValueError: If there is no such model, or the sequence lies beyond the episode's end.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.zoo.film",
+        description="Write an MP4 of a trained model, its action samples drawn as dots, and "
+        "optionally a picture of consecutive steps. Works for all environments of this package.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add_run_arguments(parser)
+    add = parser.add_argument
+    add("-n", "--n-episodes", type=int, default=1, help="episodes in the video")
+    add("--n-samples", type=int, default=300, help="action samples drawn at each step")
+    add("--deterministic", action="store_true", help="act without exploration")
+    add("--slow-down", type=float, default=1.0, help="times slower than real time")
+    add("-o", "--output", type=Path, help="video (default: film.mp4 next to the model)")
+    add("--sequence", type=Path, help="picture of consecutive steps of the first episode")
+    add("--first-step", type=int, default=17, help="first step of the sequence")
+    add("--steps", type=int, default=7, help="number of steps of the sequence")
+    args = parser.parse_args(arguments)
+
+    model, env, path = load_run(args)
+    episodes = [
+        episode_frames(model, env, args.n_samples, args.deterministic)
+        for _ in range(args.n_episodes)
+    ]
+    if args.sequence is not None:
+        sequence_figure(episodes[0], args.first_step, args.steps).savefig(args.sequence, dpi=150)
+        print(f"Sequence: {args.sequence}")
+    output = args.output or path.parent / "film.mp4"
+    fps = env.get_attr("metadata")[0]["render_fps"] / args.slow_down
+    write_video([frame for frames in episodes for frame in frames], output, fps)
+    print(f"Video of {len(episodes)} episodes: {output}")
+    env.close()
+
+
+if __name__ == "__main__":
+    main()

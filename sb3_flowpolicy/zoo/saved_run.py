@@ -1,0 +1,61 @@
+"""Models that `rl_zoo3.train` or `train_seeds` left behind, with their environments."""
+
+import argparse
+from pathlib import Path
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_flowpolicy.zoo.registration import ALGORITHMS, register
+
+
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that name a run, as `rl_zoo3.enjoy` calls them."""
+    add = parser.add_argument
+    add("--algo", default="sac_flow", choices=ALGORITHMS, help="algorithm")
+    add("--env", default="TunnelDiagonal-v0", help="environment id")
+    add("-f", "--folder", default="logs", help="log folder of the training")
+    add("--exp-id", type=int, default=0, help="run number, 0 for the latest")
+    add("--load-best", action="store_true", help="take the best model, not the last")
+    add("--model", type=Path, help="a model's zip file, instead of a run of rl_zoo3")
+    add("--seed", type=int, default=0, help="seed of the episodes")
+
+
+def load_run(args: argparse.Namespace) -> tuple[BaseAlgorithm, VecEnv, Path]:
+    """Load what the options of `add_run_arguments` name.
+
+    Returns:
+        The model, one environment of its kind that draws `rgb_array`, and the model's file.
+
+    Raises:
+        ValueError: If there is no such model.
+    """
+    register()
+    from huggingface_sb3 import EnvironmentName
+    from rl_zoo3.utils import ALGOS, create_test_env, get_model_path, get_saved_hyperparams
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.utils import set_random_seed
+
+    set_random_seed(args.seed)
+    if args.model is not None:
+        if not args.model.is_file():
+            raise ValueError(f"model must be a file that exists, got {args.model}")
+        env = make_vec_env(args.env, seed=args.seed, env_kwargs={"render_mode": "rgb_array"})
+        return ALGOS[args.algo].load(args.model, device="cpu"), env, args.model
+    env_name = EnvironmentName(args.env)
+    try:
+        _, model_path, log_path = get_model_path(
+            args.exp_id, args.folder, args.algo, env_name, args.load_best
+        )
+    except AssertionError as error:
+        raise ValueError(f"folder must hold a run of {args.algo} on {args.env}: {error}") from error
+    hyperparams, stats_path = get_saved_hyperparams(str(Path(log_path, env_name)), test_mode=True)
+    env = create_test_env(
+        env_name.gym_id,
+        stats_path=stats_path,
+        seed=args.seed,
+        should_render=False,
+        hyperparams=hyperparams,
+        env_kwargs={**hyperparams.pop("env_kwargs", {}), "render_mode": "rgb_array"},
+    )
+    return ALGOS[args.algo].load(model_path, device="cpu"), env, Path(model_path)
