@@ -8,7 +8,7 @@ import flowpolicy_envs
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 
 # One per family of what a step computes. To add one, add its id.
-ENVIRONMENTS = ("TunnelDiagonal-v0", "TunnelCircle-v0", "TunnelSpline-v0")
+ENVIRONMENTS = ("TunnelDiagonal-v0", "TunnelCircle-v0", "TunnelSpline-v0", "SquareHold-v0")
 # A familiar environment of about the same complexity, to judge the numbers by.
 PEER = "Pendulum-v1"
 BATCH = 64
