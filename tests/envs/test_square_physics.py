@@ -23,17 +23,18 @@ class World:
         self.dt = dt
         self.body, self.fingers, self.targets = np.zeros(6), PLACES.copy(), PLACES.copy()
         self.forces = np.zeros((4, 4))
-        self._scratch = np.zeros((4, kernels.N_SCRATCH))
+        self._rest = (np.zeros(kernels.SCRATCH), self.forces, np.zeros(4))
 
     def substep(self) -> None:
-        kernels.substep(
+        kernels.simulate(
             self.dt,
+            1,
             self.constants,
+            PLACES,
             self.targets,
             self.body,
             self.fingers,
-            self._scratch,
-            self.forces,
+            *self._rest,
         )
 
     def randomise(self, rng: np.random.Generator) -> None:

@@ -99,7 +99,7 @@ class SquareBatch:
             float(config.warm_steps),
             as_task(config.task).terms(),
             self.goals,
-            np.zeros((kernels.FINGERS, kernels.N_SCRATCH)),
+            np.zeros(kernels.SCRATCH),
             np.zeros((kernels.FINGERS, 4)),
             self.rewards,
             self.terminated,

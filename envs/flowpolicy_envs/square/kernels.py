@@ -51,7 +51,9 @@ N_FEATURES = 4 + ACTIONS + ACTIONS + 1
 # normal, both levers, share of the substep in contact, room to move, and bounds of the forces.
 _PUSH, _PULL, _NORMAL_X, _NORMAL_Y, _LEVER, _TANGENT_LEVER, _SHARE, _ROOM = range(8)
 _LIMIT, _LEAST_RUB, _MOST_RUB = range(8, 11)
-N_SCRATCH = 11
+# And, in the last row, what follows from the constants.
+_PER_DT, _PER_MASS, _PER_INERTIA, _PER_DRAG, _LINEAR, _ANGULAR = range(6)
+SCRATCH = (FINGERS + 1, 11)
 
 _STANDSTILL = 1e-30
 """Units or radians per second."""
@@ -75,31 +77,33 @@ def _clip(value: float, low: float, high: float) -> float:
 
 
 @_compiled
-def substep(
+def _derive(dt: float, constants: FloatArray, derived: FloatArray) -> None:
+    """Write what a substep needs of the constants into `derived`: divisions are slow."""
+    derived[_PER_DT] = 1.0 / dt
+    derived[_PER_MASS] = 1.0 / constants[MASS]
+    derived[_PER_INERTIA] = 1.0 / constants[INERTIA]
+    derived[_PER_DRAG] = 1.0 / constants[DRAG]
+    derived[_LINEAR] = 1.0 / (1.0 + dt * constants[LINEAR_DAMPING] / constants[MASS])
+    derived[_ANGULAR] = 1.0 / (1.0 + dt * constants[ANGULAR_DAMPING] / constants[INERTIA])
+
+
+@_compiled
+def _substep(
     dt: float,
     constants: FloatArray,
+    derived: FloatArray,
     targets: FloatArray,
     body: FloatArray,
     fingers: FloatArray,
     scratch: FloatArray,
     forces: FloatArray,
 ) -> None:
-    """Advance one world by `dt` seconds, in place.
-
-    Args:
-        dt: Seconds.
-        constants: Physical constants, (12,).
-        targets: Where the controllers pull the fingers, (4, 2).
-        body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
-        fingers: Positions, (4, 2).
-        scratch: Room to work in, (4, 11).
-        forces: Overwritten by the contact forces on the square, (4, 4): normal (inwards) and
-            tangential force in N, then the same force along x and y.
-    """
+    """Advance one world by `dt` seconds; the arguments are those of `simulate`."""
     half, drag, top_speed = constants[HALF_SIDE], constants[DRAG], constants[MAX_SPEED]
     stiffness, max_force = constants[STIFFNESS], constants[MAX_FORCE]
     friction = constants[FRICTION]
-    per_dt, per_mass, per_inertia = 1.0 / dt, 1.0 / constants[MASS], 1.0 / constants[INERTIA]
+    per_dt, per_mass, per_inertia = derived[_PER_DT], derived[_PER_MASS], derived[_PER_INERTIA]
+    per_drag, linear, angular = derived[_PER_DRAG], derived[_LINEAR], derived[_ANGULAR]
     x, y = body[0], body[1]
     cos, sin = math.cos(body[2]), math.sin(body[2])
     old_vx, old_vy, old_omega = body[3], body[4], body[5]
@@ -130,7 +134,7 @@ def substep(
             # Against the controller that would cost energy which nobody has paid.
             room = gap * per_dt if gap > 0.0 or push <= 0.0 else 0.0
             recede = normal_x * old_vx + normal_y * old_vy + lever * old_omega
-            approach = _clip(push / drag, -top_speed, top_speed) - recede
+            approach = _clip(push * per_drag, -top_speed, top_speed) - recede
             if approach > closing:
                 touching = True
                 # One that is still on its way presses for the rest of the substep only.
@@ -151,8 +155,6 @@ def substep(
 
     # Implicit: forces and the velocity they lead to are matched by iteration. All fingers are
     # treated alike in each sweep, which keeps mirror images mirror images.
-    linear = 1.0 / (1.0 + dt * constants[LINEAR_DAMPING] * per_mass)
-    angular = 1.0 / (1.0 + dt * constants[ANGULAR_DAMPING] * per_inertia)
     vx, vy, omega = old_vx, old_vy, old_omega
     for _ in range(SWEEPS if touching else 1):
         sum_x, sum_y, torque = 0.0, 0.0, 0.0
@@ -181,7 +183,7 @@ def substep(
 
     for i in range(FINGERS):
         normal_x, normal_y = scratch[i, _NORMAL_X], scratch[i, _NORMAL_Y]
-        push, pull = scratch[i, _PUSH] / drag, scratch[i, _PULL] / drag
+        push, pull = scratch[i, _PUSH] * per_drag, scratch[i, _PULL] * per_drag
         speed2 = push * push + pull * pull
         if speed2 > top_speed * top_speed:
             share = top_speed / math.sqrt(speed2)
@@ -192,7 +194,7 @@ def substep(
             if abs(rub) < friction * press:
                 pull = normal_x * vy - normal_y * vx + scratch[i, _TANGENT_LEVER] * omega
             else:
-                pull = _clip((scratch[i, _PULL] - rub) / drag, -top_speed, top_speed)
+                pull = _clip((scratch[i, _PULL] - rub) * per_drag, -top_speed, top_speed)
         # No finger may enter the square; one that is inside is put back on the face.
         recede = normal_x * vx + normal_y * vy + scratch[i, _LEVER] * omega
         push = min(push, recede + scratch[i, _ROOM])
@@ -231,13 +233,29 @@ def simulate(
     forces: FloatArray,
     presses: FloatArray,
 ) -> bool:
-    """Advance one world by `substeps`, or until a finger breaks; return whether one did.
+    """Advance one world by `substeps`, or until a finger breaks, in place.
 
-    `presses` (4,) is overwritten by each finger's mean normal force in N.
+    Args:
+        dt: Seconds per substep.
+        substeps: Their number.
+        constants: Physical constants, (12,).
+        starts: Where the fingers started, (4, 2).
+        targets: Where the controllers pull the fingers, (4, 2).
+        body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
+        fingers: Positions, (4, 2).
+        scratch: Room to work in, (5, 11).
+        forces: Overwritten by the contact forces on the square in the last substep, (4, 4): normal
+            (inwards) and tangential force in N, then the same force along x and y.
+        presses: Overwritten by each finger's mean normal force in N, (4,).
+
+    Returns:
+        Whether a finger broke.
     """
+    derived = scratch[FINGERS]
+    _derive(dt, constants, derived)
     presses[:] = 0.0
     for k in range(substeps):
-        substep(dt, constants, targets, body, fingers, scratch, forces)
+        _substep(dt, constants, derived, targets, body, fingers, scratch, forces)
         for i in range(FINGERS):
             presses[i] += forces[i, 0]
         if _is_broken(fingers, starts, constants[REACH]):
