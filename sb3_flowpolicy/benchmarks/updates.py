@@ -24,6 +24,8 @@ BATCH_SIZE = 256
 N_UPDATES = 64
 N_SEEDS = 10
 N_TRANSITIONS = 10_000
+# Units from which on products in bfloat16 are faster.
+WORTH_ROUNDING = 128
 SPARSE_TUNNEL = "TunnelDiagonal-v0"
 
 
@@ -96,7 +98,12 @@ def _contest(shape: Shape, policies: tuple[str, ...]) -> Contest:
         def ours(policy: str = policy) -> Work:
             return updates_of(sac(SACFlow, policy, policy, compile=True))
 
+        def rounded(policy: str = policy) -> Work:
+            return updates_of(sac(SACFlow, policy, policy, compile=True, autocast=True))
+
         entrants.append(Entrant(f"SACFlow {policy}", ours, limit=_limit_name(policy)))
+        if shape.units >= WORTH_ROUNDING and policy != "LowRankPolicy":
+            entrants.append(Entrant(f"SACFlow {policy}, bfloat16", rounded))
     if "FlowPolicy" in policies:
         limit = _limit_name("FlowPolicy")
         entrants.append(Entrant("SB3 SAC with FlowPolicy", stock_with_flow, limit=limit))

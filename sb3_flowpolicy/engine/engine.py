@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
@@ -232,13 +231,12 @@ class Engine:
         shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
         data = self.networks.actor.data
         buffers = [model.replay_buffer for model in self.models if model.replay_buffer is not None]
-        first, gamma = self.models[0], self.models[0].gamma
-        if len(buffers) == 1 and self._reads_rows(first, buffers[0]):
+        if all(map(_can_be_rows, self.models)):
             if self._rows is None or not self._rows.holds(buffers):
                 self._rows = ReplayRows(buffers)
-            index = draw_index(buffers[0], n_updates, batch_size)
+            index = draw_index(buffers, n_updates, batch_size)
             noise = th.randn(shape, dtype=data.dtype, device=data.device)
-            return self._rows.take(index, gamma, noise)
+            return self._rows.take(index, self.models[0].gamma, noise)
         columns = [
             sample_columns(
                 buffer, n_updates, batch_size, model.gamma, model.get_vec_normalize_env()
@@ -248,12 +246,6 @@ class Engine:
         stacked = [th.cat(parts, dim=1) for parts in zip(*columns, strict=True)]
         noise = th.randn(shape, dtype=data.dtype, device=data.device)
         return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
-
-    @staticmethod
-    def _reads_rows(model: SAC, buffer: ReplayBuffer) -> bool:
-        """Whole numbers, pixels say, would take four times the memory as rows of floats."""
-        real = buffer.observations.dtype.kind == "f"
-        return is_plain(buffer) and real and model.get_vec_normalize_env() is None
 
     def train(self, batches: Sequence[Batch], start: int = 0) -> th.Tensor:
         """Perform one update of all models per batch.
@@ -285,6 +277,14 @@ class Engine:
                 losses = self._update(state, batch, learning_rates, move_target)
             history.append(losses)
         return history[0] if len(history) == 1 else th.stack(history).mean(0)
+
+
+def _can_be_rows(model: SAC) -> bool:
+    """Whether minibatches can be read as rows; pixels would take four times the memory so."""
+    buffer = model.replay_buffer
+    if buffer is None or not is_plain(buffer) or model.get_vec_normalize_env() is not None:
+        return False
+    return buffer.observations.dtype.kind == "f"
 
 
 def _identity(model: SAC) -> tuple[object, ...]:

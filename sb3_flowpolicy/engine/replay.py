@@ -93,24 +93,25 @@ class ReplayRows:
         ]
 
 
-def draw_index(buffer: ReplayBuffer, n_updates: int, batch_size: int) -> th.Tensor:
+def draw_index(buffers: Sequence[ReplayBuffer], n_updates: int, batch_size: int) -> th.Tensor:
     """Draw transitions with the random numbers that SB3's own sampling would take.
 
     Returns:
-        Indices, (n_updates, 1, batch_size), counted over the buffer's environments.
+        Indices, (n_updates, S, batch_size), counted over all environments of all agents.
     """
     # SB3's buffers draw from numpy's global generator: rows, then environments, per minibatch.
     draw = np.random.randint
-    if buffer.n_envs == 1:
-        rows = draw(0, buffer.size(), size=n_updates * batch_size)
-    else:
-        parts = [
-            draw(0, buffer.size(), size=batch_size) * buffer.n_envs
-            + draw(0, buffer.n_envs, size=batch_size)
-            for _ in range(n_updates)
-        ]
-        rows = np.concatenate(parts)
-    return th.from_numpy(rows).view(n_updates, 1, batch_size)
+    width = sum(buffer.n_envs for buffer in buffers)
+    index = np.empty((n_updates, len(buffers), batch_size), np.int64)
+    for seed, buffer in enumerate(buffers):
+        first = seed * buffer.n_envs
+        if buffer.n_envs == 1:  # one call draws the same numbers as many
+            index[:, seed] = draw(0, buffer.size(), size=(n_updates, batch_size)) * width + first
+            continue
+        for k in range(n_updates):
+            rows = draw(0, buffer.size(), size=batch_size)
+            index[k, seed] = rows * width + first + draw(0, buffer.n_envs, size=batch_size)
+    return th.from_numpy(index)
 
 
 def sample_columns(
