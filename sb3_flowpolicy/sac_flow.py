@@ -59,7 +59,7 @@ class SACFlow(SAC):
             SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels but for
             weight decay, which weighs half as much at 1.0.
         compile: Whether to compile the update: several times faster after 10 to 30 seconds of
-            warm-up. ``"auto"`` does when a call of :meth:`learn` plans enough updates to repay
+            warm-up. ``"auto"`` does as soon as calls of :meth:`learn` plan enough updates to repay
             it. Compiled or not, the numbers are the same.
         autocast: Whether matrix products run in bfloat16 (``torch.autocast``), on processors that
             have it 1.2 to 1.6 times as fast for networks of 128 units or more, and slower for small
@@ -118,6 +118,7 @@ class SACFlow(SAC):
         self.compile: bool | Literal["auto"] = compile
         self.autocast = autocast
         self._worth_compiling = False
+        self._planned = 0.0
         self._engine: Engine | None = None
         self._engine_refused = False
         self._demonstrations: Any = (
@@ -171,8 +172,9 @@ class SACFlow(SAC):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        planned = self._planned_updates(total_timesteps)
-        self._worth_compiling = planned >= UPDATES_WORTH_COMPILING
+        # Many short calls of learn(), with tests in between say, are a long run as well.
+        self._planned += self._planned_updates(total_timesteps)
+        self._worth_compiling = self._planned >= UPDATES_WORTH_COMPILING
         self._engine_refused = False
         if why_unsupported(self) is not None:
             self._drop_engine()
@@ -286,7 +288,7 @@ class SACFlow(SAC):
 
     def _planned_updates(self, total_timesteps: int) -> float:
         """Count the updates that are still to come, roughly where episodes decide."""
-        steps = total_timesteps - max(self.num_timesteps, self.learning_starts)
+        steps = max(0, total_timesteps - max(self.num_timesteps, self.learning_starts))
         if self.gradient_steps < 0:
             return steps
         assert isinstance(self.train_freq, TrainFreq)
@@ -307,5 +309,5 @@ class SACFlow(SAC):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        engine = ["_engine", "_engine_refused", "_worth_compiling"]
+        engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned"]
         return [*super()._excluded_save_params(), "_demonstrations", *engine]

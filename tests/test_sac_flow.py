@@ -16,8 +16,9 @@ from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
 from stable_baselines3.common.logger import configure
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy import SACFlow, sac_flow
 from sb3_flowpolicy.demonstrations import load_demonstrations, record_demonstrations
+from sb3_flowpolicy.engine import Engine
 
 FAST: dict[str, Any] = {
     "learning_starts": 10,
@@ -228,3 +229,22 @@ def test_demonstrations_may_be_a_recipe() -> None:
         SACFlow("FlowPolicy", "SquareMove-v0", demonstrations={"controller": "a.b"}, **FAST).learn(
             1
         )
+
+
+def test_auto_compiles_once_all_calls_of_learn_together_repay_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = []
+
+    class Recorder(Engine):
+        def __init__(self, models: Any, critic_loss_coef: float, compiled: bool, *rest: Any):
+            asked.append(compiled)
+            super().__init__(models, critic_loss_coef, False, *rest)
+
+    monkeypatch.setattr(sac_flow, "Engine", Recorder)
+    monkeypatch.setattr(sac_flow, "UPDATES_WORTH_COMPILING", 50)
+    model = SACFlow("GaussPolicy", "Pendulum-v1", learning_starts=10, batch_size=8)
+    model.learn(40)  # 30 updates
+    assert not any(asked)
+    model.learn(30, reset_num_timesteps=False)  # and 30 more
+    assert asked[-1]
