@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,8 @@ class SeedBatch:
         seeds: The seeds, or their number, which stands for 0, 1, ...
         algorithm: Class of the agents.
         monitor_dir: Folder for one ``monitor.csv`` per seed, as SB3's ``Monitor`` writes them.
+        info_keywords: Numbers to note of each episode, besides return and length, from the info
+            of its last step; as SB3's ``Monitor`` has it.
         **kwargs: Arguments of the agents, the same for all.
 
     Raises:
@@ -67,11 +69,12 @@ class SeedBatch:
         seeds: int | Iterable[int],
         algorithm: type[SACFlow] = SACFlow,
         monitor_dir: str | Path | None = None,
+        info_keywords: Sequence[str] = (),
         **kwargs: Any,
     ) -> None:
         self.seeds = check_seeds(seeds)
         models = [algorithm(policy, make_env(env), seed=seed, **kwargs) for seed in self.seeds]
-        self._adopt(models, self.seeds, env, monitor_dir)
+        self._adopt(models, self.seeds, env, monitor_dir, info_keywords)
 
     def _adopt(
         self,
@@ -79,13 +82,16 @@ class SeedBatch:
         seeds: list[int],
         env: str | EnvFactory,
         monitor_dir: str | Path | None,
+        info_keywords: Sequence[str],
     ) -> None:
         self.env, self.seeds, self._models = env, seeds, models
         first = models[0]
         check_stackable(first)
         self._storage = SeedStorage(self._buffers())
         self._engine: Engine | None = None
-        self._episodes = SeedEpisodes(self._models, self.seeds, self._before_dump, monitor_dir)
+        self._episodes = SeedEpisodes(
+            self._models, self.seeds, self._before_dump, monitor_dir, info_keywords
+        )
         self._losses: th.Tensor | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
@@ -197,6 +203,7 @@ class SeedBatch:
         env: str | EnvFactory,
         algorithm: type[SACFlow] = SACFlow,
         monitor_dir: str | Path | None = None,
+        info_keywords: Sequence[str] = (),
     ) -> SeedBatch:
         """Load what :meth:`save` wrote; ``learn(..., reset_num_timesteps=False)`` goes on.
 
@@ -205,6 +212,7 @@ class SeedBatch:
             env: As at construction.
             algorithm: Class of the agents.
             monitor_dir: As at construction.
+            info_keywords: As at construction.
 
         Returns:
             The batch.
@@ -214,7 +222,7 @@ class SeedBatch:
         """
         seeds, models, noise = read_batch(folder, env, algorithm)
         batch = cls.__new__(cls)
-        batch._adopt(models, seeds, env, monitor_dir)
+        batch._adopt(models, seeds, env, monitor_dir, info_keywords)
         for name, state in noise.items():
             batch._noise[name].set_state(state)
         return batch

@@ -20,6 +20,7 @@ class SeedEpisodes:
         seeds: Their seeds, for file names.
         before_dump: Called with an index just before that model's log is written.
         monitor_dir: Folder for ``seed_<seed>.monitor.csv``; None writes none.
+        info_keywords: What else to note of an episode, from the info of its last step.
     """
 
     def __init__(
@@ -28,9 +29,11 @@ class SeedEpisodes:
         seeds: Sequence[int],
         before_dump: Callable[[int], None],
         monitor_dir: str | Path | None = None,
+        info_keywords: Sequence[str] = (),
     ) -> None:
         self.models = models
         self.before_dump = before_dump
+        self.info_keywords = tuple(info_keywords)
         self.returns = np.zeros(len(models))
         self.lengths = np.zeros(len(models), dtype=int)
         self.start = time.time()
@@ -38,7 +41,8 @@ class SeedEpisodes:
         if monitor_dir is not None:
             header: dict[str, float | str] = {"t_start": self.start}
             self.writers = [
-                ResultsWriter(str(Path(monitor_dir, f"seed_{seed}")), header) for seed in seeds
+                ResultsWriter(str(Path(monitor_dir, f"seed_{seed}")), header, self.info_keywords)
+                for seed in seeds
             ]
 
     def step(
@@ -55,18 +59,28 @@ class SeedEpisodes:
             dones: Which episodes ended, (S,).
             infos: Infos of a vectorised environment that resets in the same step.
             log_interval: Episodes between two dumps of a model's log; None dumps none.
+
+        Raises:
+            ValueError: If an info keyword is not in the infos.
         """
         self.returns += rewards
         self.lengths += 1
         if not dones.any():
             return
-        success = infos.get("final_info", {}).get("is_success")
+        final_info = infos.get("final_info", {})
+        unknown = [name for name in self.info_keywords if name not in final_info]
+        if unknown:
+            raise ValueError(
+                f"info_keywords must be in the info of an episode's last step, got {unknown}"
+            )
+        success = final_info.get("is_success")
         for seed in np.flatnonzero(dones).tolist():
             model = self.models[seed]
             episode = {
                 "r": round(float(self.returns[seed]), 6),
                 "l": int(self.lengths[seed]),
                 "t": round(time.time() - self.start, 6),
+                **{name: float(final_info[name][seed]) for name in self.info_keywords},
             }
             assert model.ep_info_buffer is not None
             assert model.ep_success_buffer is not None

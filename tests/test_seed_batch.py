@@ -286,3 +286,31 @@ def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
         settings["replay_buffer_kwargs"] = {"handle_timeout_termination": False}
     with pytest.raises(ValueError, match=message):
         SeedBatch("FlowPolicy", ENV, **settings)
+
+
+def test_info_keywords_are_noted_as_monitor_does(tmp_path: Path) -> None:
+    batch = SeedBatch(
+        "GaussPolicy",
+        "SquareMoveX-v0",
+        2,
+        monitor_dir=tmp_path,
+        info_keywords=["x_std", "x_max"],
+        **{**FAST, "learning_starts": 500, "random_steps": 500},
+    )
+    batch.learn(60)
+    noted = [
+        episode["x_max"]
+        for model in batch.models
+        if model.ep_info_buffer is not None
+        for episode in model.ep_info_buffer
+    ]
+    assert len(noted) >= 4
+    assert sorted(noted) == pytest.approx(sorted(load_results(str(tmp_path))["x_max"]))
+    # Nobody starts exactly in the middle.
+    assert min(noted) > 0
+
+
+def test_info_keywords_must_be_there() -> None:
+    batch = SeedBatch("GaussPolicy", ENV, 1, info_keywords=["x_std"], **FAST)
+    with pytest.raises(ValueError, match=r"info_keywords must be in the info .* got \['x_std'\]"):
+        batch.learn(60)

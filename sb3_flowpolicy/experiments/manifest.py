@@ -9,7 +9,7 @@ import gymnasium as gym
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS
-from sb3_flowpolicy.experiments.measures import MEASURES
+from sb3_flowpolicy.experiments.measures import MEASURES, TRAINING_INFOS
 from sb3_flowpolicy.experiments.tunnel_claims import TUNNEL_CLAIMS
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -17,7 +17,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 """Name to experiment, in the order of the claims."""
 
-_KNOWN_MEASURES = {"profile", *MEASURES}
+_KNOWN_MEASURES = {"profile", *MEASURES, *TRAINING_INFOS}
 
 
 def find(name: str) -> Experiment:

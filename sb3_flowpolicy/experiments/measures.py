@@ -73,6 +73,11 @@ MEASURES: dict[str, Callable[[SACFlow, int], float]] = {
 """Further columns of a table; an experiment names those it wants."""
 
 
+TRAINING_INFOS = ("x_std", "x_max")
+"""Further columns: means over the training episodes since the last measurement, from their infos
+(thesis Fig. 3.18)."""
+
+
 class DeterministicEpisodes:
     """Deterministic episodes of several policies, all stepped at once.
 

@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 from sb3_flowpolicy.benchmarks.report import machine
 from sb3_flowpolicy.experiments.measures import (
     MEASURES,
+    TRAINING_INFOS,
     DeterministicEpisodes,
     entropy_profile,
     policy_entropy,
@@ -103,9 +104,13 @@ class _Training:
             settings.pop("policy"),
             self.env,
             self.item.seeds,
+            info_keywords=self._infos(),
             stats_window_size=_ALL_EPISODES,
             **settings,
         )
+
+    def _infos(self) -> list[str]:
+        return [name for name in TRAINING_INFOS if name in self.item.measures]
 
     def _resume(self) -> SeedBatch | None:
         # Half-written checkpoints have another name, so the last of these is complete.
@@ -117,7 +122,7 @@ class _Training:
         self.done_steps = state["step"]
         self.seconds_before, self.cpu_before = state["seconds"], state["cpu_seconds"]
         self.sessions = state["sessions"] + 1
-        return SeedBatch.load(found[-1], self.env)
+        return SeedBatch.load(found[-1], self.env, info_keywords=self._infos())
 
     def _save(self) -> None:
         folder = self.files.checkpoints
@@ -159,6 +164,8 @@ class _Training:
                 "entropy": policy_entropy(model, seed),
                 "ent_coef": _ent_coef(model),
             }
+            for name in self._infos():
+                row[name] = _mean([episode[name] for episode in episodes])
             for name, measure in MEASURES.items():
                 if name in self.item.measures:
                     row[name] = measure(model, seed)
