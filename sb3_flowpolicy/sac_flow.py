@@ -113,6 +113,8 @@ class SACFlow(SAC):
             raise ValueError(f"critic_loss_coef must be above 0, got {critic_loss_coef}")
         if compile not in (True, False, "auto"):
             raise ValueError(f'compile must be True, False or "auto", got {compile!r}')
+        if autocast not in (True, False):
+            raise ValueError(f"autocast must be True or False, got {autocast!r}")
         self.random_steps = random_steps
         self.critic_loss_coef = critic_loss_coef
         self.compile: bool | Literal["auto"] = compile
@@ -205,13 +207,15 @@ class SACFlow(SAC):
         observations, optimisers other than Adam, ...) take SB3's own loop.
         """
         engine = self._ready_engine()
+        if engine is not None and engine.synchronize() and why_unsupported(self) is not None:
+            self._drop_engine()
+            engine = self._ready_engine()
         if engine is None:
             return self._train_with_sb3(gradient_steps, batch_size)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        engine.synchronize()
         # Minibatches are drawn for many updates at once, but not for all of an offline run.
         for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
             n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)

@@ -31,6 +31,9 @@ from sb3_flowpolicy.seed_setup import (
     make_vec_env,
 )
 
+# What agents must agree on, besides the constants of their updates.
+_COMMON = ("batch_size", "gamma", "learning_starts", "random_steps", "train_freq", "gradient_steps")
+
 
 class SeedBatch:
     """Train S independent :class:`SACFlow` agents in one process, by stacking their networks.
@@ -181,6 +184,9 @@ class SeedBatch:
             if bar is not None:
                 bar.update(collected)
             if going and first.num_timesteps > first.learning_starts and first.gradient_steps:
+                # Only callbacks can have loaded or reset anything since the last update.
+                if callbacks and self._engine is not None and self._engine.synchronize():
+                    check_stackable(first)
                 self._train()
 
     def save(self, folder: str | Path) -> None:
@@ -253,7 +259,7 @@ class SeedBatch:
         settings = settings_key(first, first.critic_loss_coef)
         for model in models:
             same = settings_key(model, model.critic_loss_coef) == settings
-            if not same or model.batch_size != first.batch_size:
+            if not same or any(getattr(model, name) != getattr(first, name) for name in _COMMON):
                 raise ValueError("agents must all have the same settings, got different ones")
         compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
         engine = self._engine
@@ -267,9 +273,8 @@ class SeedBatch:
             self._engine = Engine(models, first.critic_loss_coef, compiled, first.autocast)
         self._engine.synchronize()
         buffers = self._buffers()
-        if any(
-            mine is not theirs for mine, theirs in zip(self._storage.buffers, buffers, strict=True)
-        ):
+        # An agent that was trained on its own has its buffer's arrays to itself since then.
+        if not self._storage.rows.holds(buffers):
             self._storage = SeedStorage(buffers)
         self._storage.synchronize()
         if self._noise["rows"].shape != (first.batch_size,):

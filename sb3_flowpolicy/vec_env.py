@@ -11,6 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+import flowpolicy_envs  # noqa: F401, registers the environments
+
 
 def make_batched_env(
     env_id: str, n_envs: int = 1, seed: int | None = None, **env_kwargs: Any

@@ -314,3 +314,34 @@ def test_info_keywords_must_be_there() -> None:
     batch = SeedBatch("GaussPolicy", ENV, 1, info_keywords=["x_std"], **FAST)
     with pytest.raises(ValueError, match=r"info_keywords must be in the info .* got \['x_std'\]"):
         batch.learn(60)
+
+
+def test_agents_may_train_on_their_own_in_between() -> None:
+    batch = SeedBatch("FlowPolicy", "Pendulum-v1", 2, **FAST).learn(40)
+    batch.models[0].train(1, 16)
+    batch.models[1].train(1, 16)
+    batch.learn(30, reset_num_timesteps=False)
+    for model in batch.models:
+        assert model.replay_buffer is not None
+        assert model.replay_buffer.size() == 70
+        assert np.abs(model.replay_buffer.observations[40:70, 0]).sum(-1).min() > 0
+
+
+def test_callbacks_may_reset_optimizers_and_move_weights() -> None:
+    class Meddler(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 45:
+                assert isinstance(self.model, SACFlow)
+                self.model.actor.optimizer.state.clear()
+                for parameter in self.model.policy.parameters():
+                    parameter.data = parameter.data.clone()
+                self.before = vector(self.model)
+            if self.num_timesteps == 55:
+                assert isinstance(self.model, SACFlow)
+                assert not np.array_equal(vector(self.model), self.before)
+            return True
+
+    batch = SeedBatch("FlowPolicy", ENV, 2, **FAST).learn(60, callback=Meddler())
+    for model in batch.models:
+        steps = {float(state["step"]) for state in model.actor.optimizer.state.values()}
+        assert steps == {16.0}  # since the reset, that of step 45 included

@@ -32,6 +32,12 @@ def adam_settings(optimizer: th.optim.Optimizer) -> AdamSettings | None:
     return AdamSettings(beta1, beta2, group["eps"], group["weight_decay"], decoupled)
 
 
+def took_equal_steps(optimizer: th.optim.Optimizer) -> bool:
+    """Whether all parameters have taken as many steps: a part may have been reset."""
+    states = [optimizer.state.get(owner, {}) for owner in optimizer.param_groups[0]["params"]]
+    return len({float(state.get("step", 0)) for state in states}) <= 1
+
+
 class FlatAdam:
     """Moments of S optimisers as tensors (S, P); the optimisers' own states become views.
 
@@ -56,7 +62,7 @@ class FlatAdam:
         # One count per parameter, as in torch.optim, though they never differ.
         n_owners = len(self.flat.views(data, 0))
         self.step = th.zeros(len(data), n_owners, device=data.device)
-        self._bound: list[tuple[th.optim.Optimizer, th.Tensor, int, int]] = []
+        self._bound = []
         for seed, optimizer in enumerate(self.optimizers):
             pairs = self.flat.views(self.mean, seed), self.flat.views(self.square, seed)
             for step, (owner, mean), (_, square) in zip(self.step[seed], *pairs, strict=True):
@@ -66,21 +72,22 @@ class FlatAdam:
                     mean.copy_(state["exp_avg"])
                     square.copy_(state["exp_avg_sq"])
                 state.update(step=step, exp_avg=mean, exp_avg_sq=square)
-            owner, mean = pairs[0][-1]
-            self._bound.append((optimizer, owner, len(optimizer.state), mean.data_ptr()))
+            entries = [
+                (owner, mean, square) for (owner, mean), (_, square) in zip(*pairs, strict=True)
+            ]
+            self._bound.append((optimizer, optimizer.state, entries))
 
     def is_bound(self) -> bool:
-        """Whether the optimisers' states still are views: loading a checkpoint undoes it.
-
-        Asked before every update, it looks at one entry per optimiser: states are replaced, or
-        cleared, as a whole.
-        """
-        for optimizer, owner, count, address in self._bound:
-            state = optimizer.state
-            if len(state) != count or owner not in state:
+        """Whether the optimisers' states still are views: loading or resetting one undoes it."""
+        for optimizer, state, entries in self._bound:
+            if optimizer.state is not state or len(state) != len(entries):
                 return False
-            if state[owner]["exp_avg"].data_ptr() != address:
-                return False
+            for owner, mean, square in entries:
+                entry = state.get(owner)
+                if entry is None or entry.get("exp_avg") is not mean:
+                    return False
+                if entry.get("exp_avg_sq") is not square:
+                    return False
         return True
 
     def release(self) -> None:

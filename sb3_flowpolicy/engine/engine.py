@@ -9,7 +9,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
-from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, took_equal_steps
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.networks import StackedNetworks
@@ -59,6 +59,8 @@ def why_unsupported(model: SAC) -> str | None:
             return f"optimizer of type {type(optimizer).__name__} with these settings"
         if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
             return "optimizer with hooks"
+        if not took_equal_steps(optimizer):
+            return "optimizer of which a part was reset"
     return None
 
 
@@ -141,7 +143,7 @@ class Engine:
 
         self._rows: ReplayRows | None = None
         self._state: TrainState | None = None
-        self._fixed: list[th.Tensor] = []
+        self._fixed: list[tuple[th.Tensor, int]] = []
         self._learning_rates: tuple[list[float], th.Tensor] | None = None
         self._sample = sample
         self._compiled_sample = Compiled(sample, "the policy", device)
@@ -156,7 +158,10 @@ class Engine:
         for model, kept in zip(models, self._identities, strict=True):
             if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):
                 return False
-        return all(home[name] is parameter for home, name, parameter in self._slots)
+        return all(
+            home[name] is parameter and parameter.requires_grad == trains
+            for home, name, parameter, trains in self._slots
+        )
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
@@ -167,12 +172,19 @@ class Engine:
             *([self.ent_coef_adam] if self.ent_coef_adam is not None else []),
         ]
 
-    def synchronize(self) -> None:
-        """Take over what was loaded or moved since the last update; cheap if nothing was."""
-        if not all(part.is_bound() for part in self._parts()):
-            for part in self._parts():
-                part.bind()
-            self._state = None
+    def synchronize(self) -> bool:
+        """Take over what was loaded or moved since the last update; cheap if nothing was.
+
+        Returns:
+            Whether there was anything.
+        """
+        parts = self._parts()
+        if all(part.is_bound() for part in parts):
+            return False
+        for part in parts:
+            part.bind()
+        self._state = None
+        return True
 
     def release(self) -> None:
         """Give modules and optimisers memory of their own, until the next update."""
@@ -200,12 +212,15 @@ class Engine:
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""
-        # A fixed temperature may be set anew between two calls.
         fixed = [] if self.temperature else [model.ent_coef_tensor for model in self.models]
-        kept = self._state is not None and len(fixed) == len(self._fixed)
-        if not kept or any(now is not then for now, then in zip(fixed, self._fixed, strict=True)):
-            self._state, self._fixed = self._gather_state(fixed), fixed
-        assert self._state is not None
+        # A fixed temperature may be set anew between two calls, or changed in place.
+        known = [(tensor, tensor._version) for tensor in fixed]
+        same = len(known) == len(self._fixed) and all(
+            now is then and version == before
+            for (now, version), (then, before) in zip(known, self._fixed, strict=True)
+        )
+        if self._state is None or not same:
+            self._state, self._fixed = self._gather_state(fixed), known
         return self._state
 
     def _gather_state(self, fixed: list[th.Tensor]) -> TrainState:
@@ -298,14 +313,16 @@ def _identity(model: SAC) -> tuple[object, ...]:
     )
 
 
-def _slots(model: SAC) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter]]:
-    """Where the first parameter of each network lives, and which it is.
+def _slots(model: SAC) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter, bool]]:
+    """Where the first parameter of each network lives, which it is, and whether it is trained.
 
-    Parameters are replaced all at once, by ``load_state_dict(assign=True)`` for example.
+    Parameters are replaced or frozen all at once, by ``load_state_dict(assign=True)`` or
+    ``actor.requires_grad_(False)`` for example.
     """
     slots = []
     for network in (model.actor, model.critic, model.critic_target):
         path, parameter = next(network.named_parameters())
         module, _, name = path.rpartition(".")
-        slots.append((network.get_submodule(module)._parameters, name, parameter))
+        home = network.get_submodule(module)._parameters
+        slots.append((home, name, parameter, parameter.requires_grad))
     return slots

@@ -25,7 +25,8 @@ def is_plain(buffer: ReplayBuffer) -> bool:
 class ReplayRows:
     """Replay buffers of S agents as one array, (capacity, environments of all agents, width).
 
-    The buffers' own arrays become views of it: whoever writes to them, or saves them, goes on.
+    The buffers' own arrays become views of it: whoever writes to them, or saves them, goes on. All
+    columns are float32, which is what networks are shown of observations of any type.
 
     Args:
         buffers: Plain SB3 buffers (see :func:`is_plain`) of the same spaces, sizes and contents.
@@ -38,10 +39,9 @@ class ReplayRows:
         self.obs_shape = first.observations.shape[2:]
         samples = [getattr(first, name) for name in COLUMNS]
         self.widths = [int(np.prod(sample.shape[2:])) for sample in samples]
-        dtype = np.result_type(*samples)
         shape = (first.buffer_size, self.n_envs * len(buffers), sum(self.widths))
         # Pages that nobody wrote to take no memory yet.
-        rows = np.zeros(shape, dtype)
+        rows = np.zeros(shape, np.float32)
         self.columns = dict(zip(COLUMNS, self._views(rows, samples), strict=True))
         self._owned = []
         for index, buffer in enumerate(self.buffers):

@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -186,3 +187,56 @@ def test_released_models_own_their_memory() -> None:
         engine.networks.actor.data.zero_()
         engine.actor_adam.mean.zero_()
     assert_close(everything(models[0]), before, th.float32)
+
+
+@pytest.mark.parametrize("what", ["moment", "entries", "temperature", "frozen", "part"])
+def test_changes_between_updates_count_as_they_do_in_sb3(what: str) -> None:
+    """The engine and SB3's loop go on alike after somebody reached in."""
+
+    def reach_in(model: SAC) -> None:
+        states = model.actor.optimizer.state
+        parameters = list(model.actor.parameters())
+        if what == "moment":
+            states[parameters[1]]["exp_avg"] = th.ones_like(parameters[1])
+        elif what == "entries":
+            states.clear()
+        elif what == "temperature":
+            model.ent_coef_tensor.fill_(2.0)
+        elif what == "frozen":
+            model.actor.requires_grad_(False)
+        else:
+            del states[parameters[-1]]
+
+    def train(loop: str) -> SAC:
+        model = make(SACFlow, "FlowPolicy", th.float32, compile=False, ent_coef=0.1)
+        assert isinstance(model, SACFlow)
+        for n_updates in (3, 4):
+            seed_everything()
+            if loop == "sb3":
+                model._train_with_sb3(n_updates, BATCH_SIZE)
+            else:
+                model.train(n_updates, batch_size=BATCH_SIZE)
+            reach_in(model) if n_updates == 3 else None
+        return model
+
+    if what in ("frozen", "part"):
+        with pytest.warns(UserWarning, match="frozen" if what == "frozen" else "part was reset"):
+            ours = train("engine")
+    else:
+        ours = train("engine")
+    theirs = train("sb3")
+    ours_then, theirs_then = (m.policy.parameters_to_vector() for m in (ours, theirs))
+    np.testing.assert_allclose(ours_then, theirs_then, rtol=1e-4, atol=1e-5)
+
+
+def test_replay_columns_stay_what_sb3_can_train_with() -> None:
+    env = gym.make("Pendulum-v1")
+    space = env.observation_space
+    assert isinstance(space, gym.spaces.Box)
+    double = gym.spaces.Box(space.low, space.high, dtype=np.float64)
+    env = gym.wrappers.TransformObservation(env, lambda obs: obs.astype(np.float64), double)
+    model = SACFlow("GaussPolicy", env, learning_starts=10, batch_size=8, compile=False, seed=0)
+    model.learn(20)
+    assert model.replay_buffer is not None
+    assert model.replay_buffer.rewards.dtype == model.replay_buffer.actions.dtype == np.float32
+    model._train_with_sb3(1, 8)

@@ -107,6 +107,11 @@ class SquareConfig:
         for name in ("finger_distance", "finger_noise", "warm_up"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)}")
+        if self.finger_distance < ranges["size"][1] / 2:
+            raise ValueError(
+                f"finger_distance must be at least half the size, {ranges['size'][1] / 2:g}, "
+                f"got {self.finger_distance}: fingers start outside the square"
+            )
         if not 0.0 < self.dt < math.inf:
             raise ValueError(f"dt must be positive, got {self.dt}")
         for name in ("stack", "substeps"):
