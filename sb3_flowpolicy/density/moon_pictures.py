@@ -42,24 +42,23 @@ def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     data, seed = TwoMoons(), ours.ensemble.seeds[ours.middle]
     scaler = ours.scalers[ours.middle]
     points = scaler.apply(data.draw(data.n_train, seed).points)
-    figure, panels = grid_of_panels(len(fits) + 1, 3)
-    draw_points(panels[0], points, MOONS_EXTENT, "training data", GREY)
-    for axes, fitted in zip(panels[1:], fits, strict=True):
-        samples = sample(fitted, np.zeros((data.n_train, 0)))
-        draw_points(axes, samples, MOONS_EXTENT, LABELS[fitted.model])
-    save(figure, folder / "two-moons-samples.png")
-
-    figure, panels = grid_of_panels(len(fits) + 1, 3)
     middle = ((np.arange(scale.pixels) + 0.5) / scale.pixels * 2 - 1) * MOONS_EXTENT
     plane = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
     raw = Sample(plane * scaler.scale + scaler.mean, np.zeros((len(plane), 0)))
     truth = np.exp(data.log_density(raw) + scaler.log_volume).reshape(scale.pixels, scale.pixels)
-    draw_density(panels[0], truth, MOONS_EXTENT, "true density")
-    for axes, fitted in zip(panels[1:], fits, strict=True):
-        model = fitted.ensemble.member(fitted.middle)
-        density = picture(model, np.zeros(0), MOONS_EXTENT, scale.pixels)
-        draw_density(axes, density, MOONS_EXTENT, LABELS[fitted.model])
-    save(figure, folder / "two-moons-density.png")
+    for kind in ("samples", "density"):
+        figure, panels = grid_of_panels(len(fits) + 2, 4)
+        draw_density(panels[0], truth, MOONS_EXTENT, "true density")
+        draw_points(panels[1], points, MOONS_EXTENT, "training data", GREY)
+        for axes, fitted in zip(panels[2:], fits, strict=True):
+            if kind == "samples":
+                samples = sample(fitted, np.zeros((data.n_train, 0)))
+                draw_points(axes, samples, MOONS_EXTENT, LABELS[fitted.model])
+            else:
+                model = fitted.ensemble.member(fitted.middle)
+                density = picture(model, np.zeros(0), MOONS_EXTENT, scale.pixels)
+                draw_density(axes, density, MOONS_EXTENT, LABELS[fitted.model])
+        save(figure, folder / f"two-moons-{kind}.png")
 
     model = ours.ensemble.member(ours.middle)
     assert isinstance(model, OurRealNVP)

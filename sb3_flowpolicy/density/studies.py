@@ -102,7 +102,7 @@ STUDIES = {
                 "maf": Recipe(epochs=1000),
                 "maf-random": Recipe(epochs=1000),
                 # A step of these costs several times as much.
-                "naf": Recipe(epochs=400),
+                "naf": Recipe(epochs=600),
                 "nsf": Recipe(epochs=500),
             },
             thesis=(
