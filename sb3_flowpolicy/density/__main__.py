@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
         else:
             origin = args.out / "origin.txt"
             print(write_report(args.out, origin.read_text() if origin.exists() else ""))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         parser.error(str(error))
 
 
