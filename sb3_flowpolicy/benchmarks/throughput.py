@@ -46,7 +46,7 @@ _EPILOG = """\
 examples:
   python -m sb3_flowpolicy.benchmarks.throughput --quick
   python -m sb3_flowpolicy.benchmarks.throughput --json throughput.json
-  python -m sb3_flowpolicy.benchmarks.throughput --only updates --threads 2 --json updates.json
+  python -m sb3_flowpolicy.benchmarks.throughput --only updates --threads 1 --json updates.json
 
 A full run takes about ten minutes, most of them compiling. Compare ratios, not rates, between
 machines, and only where "threads" agree."""
@@ -142,7 +142,10 @@ def _parser() -> argparse.ArgumentParser:
         help=f"measure one group: {', '.join(GROUPS)}; may be repeated (default: all)",
     )
     parser.add_argument(
-        "--threads", type=int, default=1, help="threads of torch (default: %(default)s)"
+        "--threads",
+        type=int,
+        default=th.get_num_threads(),
+        help="threads of torch (default: torch's own, %(default)s here)",
     )
     parser.add_argument(
         "--rounds",

@@ -14,6 +14,7 @@ from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
+from sb3_flowpolicy.engine.threads import threads_for
 from sb3_flowpolicy.engine.update import (
     Batch,
     Moments,
@@ -206,9 +207,10 @@ class Engine:
         if noise is None:
             shape = (*obs.shape[:2], self.networks.noise_dim)
             noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
-        if self._runs_compiled():
-            return self._compiled_sample(obs.shape, actor, obs, noise)
-        return self._sample(actor, obs, noise)
+        with threads_for(actor.numel() * obs.shape[1]):
+            if self._runs_compiled():
+                return self._compiled_sample(obs.shape, actor, obs, noise)
+            return self._sample(actor, obs, noise)
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""
@@ -283,14 +285,16 @@ class Engine:
         learning_rates = self._learning_rates[1]
         state = self.state()
         history = []
-        for k, batch in enumerate(batches, start):
-            move_target = k % first.target_update_interval == 0
-            if self._runs_compiled():
-                key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), move_target)
-                losses = self._compiled_update(key, state, batch, learning_rates, move_target)
-            else:
-                losses = self._update(state, batch, learning_rates, move_target)
-            history.append(losses)
+        n_parameters = state.actor.numel() + state.critic.numel()
+        with threads_for(n_parameters * batches[0].rewards.shape[1]):
+            for k, batch in enumerate(batches, start):
+                move_target = k % first.target_update_interval == 0
+                if self._runs_compiled():
+                    key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), move_target)
+                    losses = self._compiled_update(key, state, batch, learning_rates, move_target)
+                else:
+                    losses = self._update(state, batch, learning_rates, move_target)
+                history.append(losses)
         return history[0] if len(history) == 1 else th.stack(history).mean(0)
 
 
