@@ -84,8 +84,9 @@ def train_frequency(name: str, value: Any) -> int | tuple[int, str]:
     """Accept a number of steps, or a pair such as ``(1, "episode")``."""
     if not isinstance(value, tuple):
         return integer(1)(name, value)
-    unit = value[1] if len(value) == 2 else None
-    unit = unit.value if isinstance(value, TrainFreq) else unit
+    unit: Any = value[1] if len(value) == 2 else None
+    if isinstance(value, TrainFreq):
+        unit = value.unit.value
     if unit not in ("step", "episode"):
         raise ValueError(f'{name} must be an integer or (integer, "step" | "episode"), got {value}')
     return integer(1)(name, value[0]), unit

@@ -137,7 +137,7 @@ def _read(file: BinaryIO, size: int) -> tuple[Any, Arrays]:
     arrays: Arrays = {}
     for name, entry in table.items():
         array = np.empty(entry["shape"], _DTYPES[entry["dtype"]])
-        view = memoryview(array.reshape(-1).view(np.uint8))
+        view = array.reshape(-1).view(np.uint8).data
         if file.readinto(view) != len(view):  # type: ignore[attr-defined]
             raise BundleError("must not change while it is read")
         digest.update(view)

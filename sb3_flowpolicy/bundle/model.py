@@ -23,8 +23,8 @@ from stable_baselines3.common.vec_env import (
 import sb3_flowpolicy
 from sb3_flowpolicy.bundle.container import Arrays, BundleError, read_container, write_container
 from sb3_flowpolicy.bundle.normalization import (
-    Normalization,
     normalization_from_spec,
+    normalization_of,
     normalization_to_spec,
 )
 from sb3_flowpolicy.bundle.optimizers import load_optimizer, optimizer_to_spec
@@ -91,7 +91,7 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model must be finite to be worth sharing, got NaN or inf in {name}")
-    known = _normalization(model, vec_normalize)
+    known = normalization_of(model, vec_normalize)
     spec = None if known is None else normalization_to_spec("normalization", known, arrays)
     config = {
         "format": FORMAT,
@@ -241,13 +241,6 @@ def _wrapped(cls: type[SAC], env: Any, parts: dict[str, Any]) -> VecEnv:
     env = cls._wrap_env(env)
     check_for_correct_spaces(env, parts["observation_space"], parts["action_space"])
     return env
-
-
-def _normalization(model: SAC, given: VecNormalize | None) -> Normalization | None:
-    live = given if given is not None else model.get_vec_normalize_env()
-    if live is not None:
-        return Normalization.of(live)
-    return getattr(model, "normalization", None)
 
 
 def _temperature(model: SAC) -> th.Tensor:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -97,9 +98,23 @@ class Normalization:
                 )
         copies = {key: rms.copy() for key, rms in self.statistics.items()}
         if copies:
-            wrapped.obs_rms = copies[_ONLY] if _ONLY in copies else copies  # type: ignore[assignment]
+            wrapped.obs_rms = copies.get(_ONLY, copies)  # type: ignore[assignment]
         wrapped.ret_rms = self.returns.copy()
         return wrapped
+
+
+def normalization_of(model: SAC, vec_normalize: VecNormalize | None = None) -> Normalization | None:
+    """Return what is known about a model's observations.
+
+    Args:
+        model: A model, behind ``VecNormalize`` or not.
+        vec_normalize: Statistics that go before the model's own.
+
+    Returns:
+        These, those of the model's environment, those that came with its bundle, or None.
+    """
+    live = vec_normalize if vec_normalize is not None else model.get_vec_normalize_env()
+    return Normalization.of(live) if live is not None else getattr(model, "normalization", None)
 
 
 def normalization_to_spec(name: str, known: Normalization, arrays: Arrays) -> dict[str, Any]:
@@ -143,14 +158,19 @@ def normalization_from_spec(
 
 
 def _statistics(name: str, shape: tuple[int, ...] | None, arrays: Arrays) -> RunningMeanStd:
-    values = {key: arrays.pop(f"{name}.{key}", None) for key in ("mean", "var", "count")}
-    for key, value in values.items():
-        wanted = () if key == "count" else shape
-        if value is None or value.dtype != np.float64 or value.shape != wanted:
-            got = None if value is None else f"{value.dtype} {value.shape}"
-            raise ValueError(f"{name}.{key} must be float64 of shape {wanted}, got {got}")
-        if not np.isfinite(value).all() or (key != "mean" and (value < 0).any()):
-            raise ValueError(f"{name}.{key} must be finite, and at least 0 but for a mean")
     rms = RunningMeanStd(shape=shape or ())
-    rms.mean, rms.var, rms.count = values["mean"], values["var"], float(values["count"])
+    rms.mean, rms.var = (_moment(f"{name}.{key}", shape, arrays) for key in ("mean", "var"))
+    rms.count = float(_moment(f"{name}.count", (), arrays))
+    if (rms.var < 0).any() or rms.count < 0:
+        raise ValueError(f"{name} must have a variance and a count of at least 0")
     return rms
+
+
+def _moment(name: str, shape: tuple[int, ...] | None, arrays: Arrays) -> np.ndarray:
+    value = arrays.pop(name, None)
+    if value is None or value.dtype != np.float64 or value.shape != shape:
+        got = "none" if value is None else f"{value.dtype} {value.shape}"
+        raise ValueError(f"{name} must be float64 of shape {shape}, got {got}")
+    if not np.isfinite(value).all():
+        raise ValueError(f"{name} must be finite, got NaN or infinity")
+    return value

@@ -128,7 +128,8 @@ def _checked(
         shape = () if key == "step" else tuple(parameter.shape)
         if array.dtype != dtype or array.shape != shape:
             raise ValueError(
-                f"{name} must be {np.dtype(dtype)} of shape {shape}, got {array.dtype} {array.shape}"
+                f"{name} must be {np.dtype(dtype)} of shape {shape}, "
+                f"got {array.dtype} {array.shape}"
             )
     if not np.isfinite(array).all() or (_STATE[key] and (array < 0).any()):
         raise ValueError(f"{name} must be finite{', at least 0' * _STATE[key]}, got other numbers")

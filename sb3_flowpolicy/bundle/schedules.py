@@ -22,6 +22,7 @@ class LineToZero:
         self.initial_value = initial_value
 
     def __call__(self, progress_remaining: float) -> float:
+        """Return the rate where ``progress_remaining`` falls from 1 to 0."""
         return progress_remaining * self.initial_value
 
 
