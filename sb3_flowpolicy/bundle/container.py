@@ -106,16 +106,18 @@ def read_container(path: Path) -> tuple[Any, Arrays]:
     try:
         # A named pipe would otherwise be waited for.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    except (OSError, ValueError) as error:
-        raise BundleError(f"path must be a file that can be read, got {path} ({error})") from error
-    with open(handle, "rb") as file:
-        status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode):
-            raise BundleError(f"path must be a regular file, got {path}")
         try:
-            return _read(file, status.st_size)
-        except (BundleError, OSError, MemoryError) as error:
-            raise BundleError(f"{path} {error}") from error
+            status = os.fstat(handle)
+            if not stat.S_ISREG(status.st_mode):
+                raise BundleError("must be a regular file")
+            with open(handle, "rb", closefd=False) as file:
+                return _read(file, status.st_size)
+        finally:
+            os.close(handle)
+    except BundleError as error:
+        raise BundleError(f"{path} {error}") from error
+    except (OSError, ValueError, MemoryError) as error:
+        raise BundleError(f"{path} must be a file that can be read, got {error}") from error
 
 
 def _read(file: BinaryIO, size: int) -> tuple[Any, Arrays]:

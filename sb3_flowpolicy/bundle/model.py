@@ -145,6 +145,8 @@ def _parse(config: Any, arrays: Arrays) -> dict[str, Any]:
     _expect_keys("settings", config["settings"], {"learning_rate", *SETTINGS})
     _expect_keys("progress", config["progress"], set(_PROGRESS))
     _expect_keys("made_with", config["made_with"], set(_made_with()))
+    if not all(isinstance(version, str) for version in config["made_with"].values()):
+        raise ValueError(f"made_with must name versions, got {str(config['made_with'])[:80]}")
     n_arrays = len(arrays)
     action_space = space_from_spec("action_space", config["action_space"], arrays)
     space = space_from_spec("observation_space", config["observation_space"], arrays)
@@ -159,7 +161,9 @@ def _parse(config: Any, arrays: Arrays) -> dict[str, Any]:
     }
     for name, check in SETTINGS.items():
         value = config["settings"][name]
-        value = tuple(value) if name == "train_freq" and isinstance(value, list) else value
+        if name == "train_freq":
+            # A plain number would mean steps, but is not what is saved.
+            value = tuple(value) if isinstance(value, list) else ()
         parts[_ATTRIBUTES.get(name, name)] = check(name, value)
     # By the time of saving, "auto" has become a number.
     number()("target_entropy", parts["target_entropy"])

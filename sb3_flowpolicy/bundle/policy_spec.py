@@ -15,7 +15,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_flowpolicy import policies
 from sb3_flowpolicy.policies import DistributionPolicy
-from sb3_flowpolicy.settings import flag, integer, number, optional
+from sb3_flowpolicy.settings import Check, flag, integer, number, optional
 
 
 def _by_name(*classes: type) -> dict[str, Any]:
@@ -42,8 +42,17 @@ _CLASSES = {
     "features_extractor_class": _by_name(FlattenExtractor, NatureCNN, CombinedExtractor),
     "optimizer_class": _by_name(th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop),
 }
-_PLAIN = {
-    "use_sde": flag,
+
+
+def _without_sde(name: str, value: Any) -> bool:
+    # Its noise is drawn while the policy is built, which cannot be done without memory.
+    if flag(name, value):
+        raise ValueError(f"{name} must be False for a safe bundle, got True: use model.save()")
+    return value
+
+
+_PLAIN: dict[str, Check] = {
+    "use_sde": _without_sde,
     "log_std_init": number(),
     "use_expln": flag,
     "clip_mean": number(0),

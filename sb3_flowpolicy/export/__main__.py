@@ -39,7 +39,9 @@ def main(arguments: list[str] | None = None) -> None:
         if args.stochastic and args.format == "safe":
             raise ValueError("--stochastic is for onnx: a safe bundle can always sample")
         model = _load_model(args.model)
-        statistics = args.vecnormalize or find_statistics(args.model)
+        # Beside a bundle no pickle is looked for: a bundle has its statistics inside.
+        beside = find_statistics(args.model) if zipfile.is_zipfile(args.model) else None
+        statistics = args.vecnormalize or beside
         vec_normalize = None if statistics is None else _load_statistics(statistics)
         output = args.output or args.model.with_suffix("." + _SUFFIXES[args.format])
         if args.format == "safe":
