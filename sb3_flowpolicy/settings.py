@@ -63,8 +63,14 @@ def either(choice: str, check: Check) -> Check:
 
 
 def is_number(value: Any) -> bool:
-    """Whether this is a real number: no boolean, no array."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+    """Whether this is a real number that floats can hold: no boolean, no array."""
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    try:
+        float(value)
+    except OverflowError:
+        return False
+    return True
 
 
 def temperature(name: str, value: Any) -> str | float:

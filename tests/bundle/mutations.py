@@ -65,7 +65,8 @@ def by_chance(content: bytes, rng: Rng) -> bytes:
     place = int(rng.integers(len(raw)))
     # Half of it in the header, which is a small part of the file.
     if rng.random() < 0.5:
-        place = int(rng.integers(8 + int.from_bytes(content[:8], "little")))
+        header = 8 + int.from_bytes(content[:8], "little")
+        place = int(rng.integers(min(header, len(raw))))
     action = rng.integers(6)
     some = rng.bytes(int(rng.integers(1, 50)))
     if action == 0:

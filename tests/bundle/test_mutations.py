@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_flowpolicy import BundleError, SACFlow
-from tests.bundle.conftest import dumps, make_model, parts_of, sealed
+from tests.bundle.conftest import make_model, parts_of, sealed
 from tests.bundle.mutations import HOSTILE, KNOWING, by_chance
+from tests.fuzz.effort import fuzz
 
 
 def outcome(content: bytes, path: Path) -> str:
@@ -43,14 +44,14 @@ def without_versions(content: bytes) -> tuple:
     """What saving again has to reproduce; which versions it was made with may be another tale."""
     header, config, data = parts_of(content)
     del header["__metadata__"], config["made_with"]
-    return header, dumps(config), data
+    return header, config, data  # numbers are compared as numbers: -1 is -1.0
 
 
 def test_the_original_is_loaded(bundle: Path, tmp_path: Path) -> None:
     assert outcome(bundle.read_bytes(), tmp_path / "same") == "loaded"
 
 
-@settings(max_examples=300, deadline=None, database=None)
+@fuzz(200)
 @given(seed=st.integers(0, 2**32))
 def test_whatever_happens_by_chance_is_noticed(bundle: Path, seed: int) -> None:
     content = bundle.read_bytes()
@@ -73,12 +74,7 @@ def test_every_single_byte_counts(bundle: Path, tmp_path: Path) -> None:
         assert outcome(content[:cut], path) == "refused", cut
 
 
-@settings(
-    max_examples=400,
-    deadline=None,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-)
+@fuzz(200)
 @given(seed=st.integers(0, 2**32), spoil=st.sampled_from(KNOWING))
 def test_those_who_know_the_format_get_nowhere(bundle: Path, seed: int, spoil) -> None:
     try:
@@ -88,7 +84,7 @@ def test_those_who_know_the_format_get_nowhere(bundle: Path, seed: int, spoil) -
     outcome(spoiled, bundle.with_name("spoiled.safetensors"))
 
 
-@settings(max_examples=150, deadline=None, database=None)
+@fuzz(120)
 @given(
     value=st.recursive(
         st.one_of(st.sampled_from(HOSTILE), st.integers(), st.floats(allow_nan=False), st.text()),
@@ -137,14 +133,16 @@ def test_ten_thousand_spoiled_bundles(bundle: Path, tmp_path: Path) -> None:
 MEMORY = """
 import resource, sys
 from sb3_flowpolicy import BundleError, SACFlow
-small, big = sys.argv[1:]
+small, absurd, big = sys.argv[1:]
 SACFlow.load_safe(small, device="cpu").predict([0.0, 0.0, 0.0])
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-try:
-    SACFlow.load_safe(big, device="cpu")
-except BundleError as error:
-    print("refused", end=" ")
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+for path in (absurd, big):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        SACFlow.load_safe(path, device="cpu")
+        print("loaded")
+    except BundleError:
+        print("refused")
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 """
 
 
@@ -159,8 +157,7 @@ def test_memory_stays_below_twice_the_file(bundle: Path, tmp_path: Path) -> None
     config["policy_kwargs"]["net_arch"] = [10**9, 10**9]
     absurd = tmp_path / "absurd.safetensors"
     absurd.write_bytes(sealed(header, config, data))
-    for path, refused in ((big, False), (absurd, True)):
-        command = [sys.executable, "-c", MEMORY, str(bundle), str(path)]
-        out = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
-        assert out[:-1] == ["refused"] * refused
-        assert int(out[-1]) < 2 * path.stat().st_size
+    command = [sys.executable, "-c", MEMORY, str(bundle), str(absurd), str(big)]
+    out = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert out[::2] == ["refused", "loaded"]
+    assert max(int(grown) for grown in out[1::2]) < 2 * big.stat().st_size
