@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from flowpolicy_envs.checks import is_whole
+
 if TYPE_CHECKING:
     import pygame
 

@@ -79,7 +79,7 @@ def test_tasks(task: Any, value: Any) -> None:
     works_or_says_why(task, held=value)
 
 
-CONSTRUCTOR = [*SETTINGS, "policy_kwargs", "replay_buffer_kwargs", "verbose", "learning_rate"]
+CONSTRUCTOR = [*SETTINGS, "policy_kwargs", "verbose", "learning_rate"]
 
 
 @fuzz(250)
