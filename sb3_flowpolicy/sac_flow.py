@@ -86,7 +86,7 @@ class SACFlow(SAC):
         >>> _ = model.learn(30)
     """
 
-    #: What a bundle told about ``VecNormalize``; see :meth:`load_safe`.
+    #: What a bundle that was loaded without environment says about ``VecNormalize``.
     normalization: Normalization | None = None
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -174,6 +174,8 @@ class SACFlow(SAC):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        if self.replay_buffer is None:
+            raise ValueError("learn() needs a replay buffer: give env to load_safe to train on")
         # Here and not at construction: a model that is loaded to act needs no demonstrations.
         if self._demonstrations is not None:
             if is_recipe(self._demonstrations):

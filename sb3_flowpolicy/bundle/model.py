@@ -200,7 +200,10 @@ def _build(
         _init_setup_model=False,
     )
     model.__dict__.update(attributes)
-    if env is None:
+    if env is not None:
+        model.__dict__["normalization"] = None  # the environment knows, and goes on learning
+    else:
+        model.n_envs = 1
         # To act, no buffer is needed, and the file decides how large one would be.
         model.replay_buffer = _NO_BUFFER
     model._setup_model()

@@ -85,17 +85,16 @@ class Normalization:
         Raises:
             ValueError: If they observe something of another shape.
         """
+        parts = _parts(env.observation_space)
+        for key, rms in self.statistics.items():
+            if key not in parts or parts[key].shape != rms.mean.shape:
+                shapes = {name: known.mean.shape for name, known in self.statistics.items()}
+                raise ValueError(
+                    f"env must have observations of the shapes that were normalised, {shapes}, got "
+                    f"{env.observation_space}"
+                )
         keys = [key for key in self.statistics if key != _ONLY] or None
         wrapped = VecNormalize(env, **self.settings, norm_obs_keys=keys)
-        fresh: Any = wrapped.obs_rms if self.settings["norm_obs"] else {}
-        fresh = fresh if isinstance(fresh, dict) else {_ONLY: fresh}
-        for key, rms in fresh.items():
-            if key not in self.statistics or rms.mean.shape != self.statistics[key].mean.shape:
-                raise ValueError(
-                    f"env must have observations of the shapes that were normalised, "
-                    f"{ {k: v.mean.shape for k, v in self.statistics.items()} }, got {key!r} of "
-                    f"shape {rms.mean.shape}"
-                )
         copies = {key: rms.copy() for key, rms in self.statistics.items()}
         if copies:
             wrapped.obs_rms = copies.get(_ONLY, copies)  # type: ignore[assignment]
@@ -144,7 +143,7 @@ def normalization_from_spec(
     if not isinstance(spec, dict) or set(spec) != {*_SETTINGS, "keys"}:
         raise ValueError(f"{name} must have {[*_SETTINGS, 'keys']}, got {str(spec)[:80]}")
     settings = {key: check(f"{name}.{key}", spec[key]) for key, check in _SETTINGS.items()}
-    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {_ONLY: space}
+    parts = _parts(space)
     keys = spec["keys"]
     if not isinstance(keys, list) or not all(isinstance(k, str) and k in parts for k in keys):
         raise ValueError(f"{name}.keys must be among {list(parts)}, got {str(keys)[:80]}")
@@ -155,6 +154,10 @@ def normalization_from_spec(
         _statistics(f"{name}.{index}", shape, arrays) for index, shape in enumerate([*shapes, ()])
     ]
     return Normalization(settings, dict(zip(keys, found, strict=False)), found[-1])
+
+
+def _parts(space: spaces.Space) -> dict[str, spaces.Space]:
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {_ONLY: space}
 
 
 def _statistics(name: str, shape: tuple[int, ...] | None, arrays: Arrays) -> RunningMeanStd:

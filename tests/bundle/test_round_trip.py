@@ -140,6 +140,10 @@ def test_acts_and_learns_on_as_if_never_saved(case: str, tmp_path: Path) -> None
 
 
 def test_goes_on_learning_in_an_environment(bundle: Path) -> None:
+    idle = SACFlow.load_safe(bundle, device="cpu")
+    idle.set_env(gym.make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="give env to load_safe to train on"):
+        idle.learn(1)
     raw = gym.make("Pendulum-v1")
     model = SACFlow.load_safe(bundle, env=raw, device="cpu")
     env = model.get_vec_normalize_env()
@@ -198,6 +202,11 @@ def dictionary_env() -> gym.Env:
 def test_an_environment_with_other_spaces_is_refused(bundle: Path) -> None:
     with pytest.raises(ValueError, match="env must have observations of the shapes"):
         SACFlow.load_safe(bundle, env="MountainCarContinuous-v0")
+    with pytest.raises(ValueError, match="env must have observations of the shapes"):
+        SACFlow.load_safe(bundle, env=dictionary_env())
+    path = make_model().save_safe(bundle.with_name("plain"))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        SACFlow.load_safe(path, env="MountainCarContinuous-v0")
 
 
 def test_any_reader_of_safetensors_can_open_it(bundle: Path) -> None:
