@@ -9,7 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_flowpolicy.bundle import BundleError
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
+    from sb3_flowpolicy.export import export_onnx
     from sb3_flowpolicy.policies import (
         CnnFlowPolicy,
         CnnGaussPolicy,
@@ -28,6 +30,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ActionDistribution",
+    "BundleError",
     "CnnFlowPolicy",
     "CnnGaussPolicy",
     "CnnLowRankPolicy",
@@ -39,13 +42,16 @@ __all__ = [
     "MultiInputLowRankPolicy",
     "SACFlow",
     "SeedBatch",
+    "export_onnx",
     "register_distribution",
 ]
 
 _ELSEWHERE = {
     "ActionDistribution": "distributions",
+    "BundleError": "bundle",
     "SACFlow": "sac_flow",
     "SeedBatch": "seed_batch",
+    "export_onnx": "export",
     "register_distribution": "distributions",
 }
 

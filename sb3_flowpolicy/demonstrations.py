@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import math
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import gymnasium as gym
 import numpy as np
@@ -130,8 +131,7 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     if isinstance(source, Mapping):
         arrays = dict(source)
     elif isinstance(source, str | Path) and zipfile.is_zipfile(source):
-        with np.load(source, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays = _read_npz(source)
     else:
         raise ValueError(
             f"demonstrations must be arrays or an .npz file that exists, got {source!r}"
@@ -139,7 +139,7 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     missing = [key for key in KEYS if key not in arrays]
     if missing:
         raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")
-    arrays = {key: np.asarray(arrays[key]) for key in KEYS}
+    arrays = {key: _numbers(key, arrays[key]) for key in KEYS}
     for key in ("rewards", "terminations", "truncations"):
         arrays[key] = arrays[key].reshape(-1)
     for key in ("terminations", "truncations"):
@@ -151,6 +151,47 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     if len(set(lengths.values())) > 1 or not lengths["actions"]:
         raise ValueError(f"demonstrations must have equally many rows, at least 1, got {lengths}")
     return arrays
+
+
+def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
+    """Read our arrays and no others; nothing is unpickled, nor allocated without data for it."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+            for name in sizes.keys() & {f"{key}.npy" for key in KEYS}:
+                with archive.open(name) as member:
+                    _check_size(member, sizes[name])
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in KEYS if key in file}
+    # Zips and arrays of someone else's making: numpy, zipfile and zlib raise what they come across.
+    except Exception as error:
+        raise ValueError(
+            f"demonstrations must be an .npz file of arrays of numbers, got {path} "
+            f"({type(error).__name__}: {error})"
+        ) from error
+
+
+def _check_size(file: IO[bytes], size: int) -> None:
+    """Raise ``ValueError`` if an array's head promises other than ``size`` bytes in all."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+    read = np.lib.format.read_array_header_2_0 if version == (2, 0) else read
+    if read is None:
+        raise ValueError(f"format version {version}")
+    shape, _, dtype = read(file)
+    if dtype.hasobject or file.tell() + math.prod(shape) * dtype.itemsize != size:
+        raise ValueError(f"{size} bytes for {dtype} of shape {shape}")
+
+
+def _numbers(key: str, values: Any) -> np.ndarray:
+    """Return an array, or raise ``ValueError`` if it does not hold real numbers."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"demonstrations must have one shape per row in {key}: {error}") from error
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"demonstrations must be numbers, got {array.dtype} in {key}")
+    return array
 
 
 def fill_replay_buffer(

@@ -32,6 +32,8 @@ def load_hyperparameters(algo: str, env_id: str) -> dict[str, Any]:
     known = sorted(f.name.removesuffix(".yml") for f in folder.iterdir() if f.name.endswith(".yml"))
     if algo not in known:
         raise ValueError(f"algo must be one of {known}, got {algo!r}")
+    if not isinstance(env_id, str):
+        raise ValueError(f"env_id must be a string, got {env_id!r}")
     blocks = yaml.safe_load((folder / f"{algo}.yml").read_text())
     block = blocks.get(env_id, blocks["default"])
     return {key: value for key, value in block.items() if key not in _FOR_THE_ZOO}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import warnings
 from collections.abc import Mapping
@@ -15,9 +16,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
+from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
 from sb3_flowpolicy.demonstrations import (
     fill_replay_buffer,
     follow_recipe,
@@ -26,12 +29,15 @@ from sb3_flowpolicy.demonstrations import (
 )
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
 from sb3_flowpolicy.policies.sac import check_finite_actions
+from sb3_flowpolicy.settings import check_settings
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
 # Compiling takes 10 to 30 seconds and saves one to five milliseconds per update.
 UPDATES_WORTH_COMPILING = 10_000
 MOST_DRAWN_AT_ONCE = 1000
+# Names of SAC's arguments after self, policy and env, for those that come by position.
+_SAC_ARGUMENTS = list(inspect.signature(SAC.__init__).parameters)[3:]
 
 SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
 
@@ -80,6 +86,9 @@ class SACFlow(SAC):
         >>> _ = model.learn(30)
     """
 
+    #: What a bundle that was loaded without environment says about ``VecNormalize``.
+    normalization: Normalization | None = None
+
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": policies.FlowPolicy,
         "CnnPolicy": policies.CnnFlowPolicy,
@@ -107,14 +116,16 @@ class SACFlow(SAC):
         autocast: bool = False,
         **sac_kwargs: Any,
     ) -> None:
-        if random_steps is not None and random_steps < 0:
-            raise ValueError(f"random_steps must be at least 0, got {random_steps}")
-        if not 0 < critic_loss_coef < float("inf"):
-            raise ValueError(f"critic_loss_coef must be above 0, got {critic_loss_coef}")
-        if compile not in (True, False, "auto"):
-            raise ValueError(f'compile must be True, False or "auto", got {compile!r}')
-        if autocast not in (True, False):
-            raise ValueError(f"autocast must be True or False, got {autocast!r}")
+        check_settings(
+            {
+                **dict(zip(_SAC_ARGUMENTS, sac_args, strict=False)),
+                **sac_kwargs,
+                "random_steps": random_steps,
+                "critic_loss_coef": critic_loss_coef,
+                "compile": compile,
+                "autocast": autocast,
+            }
+        )
         self.random_steps = random_steps
         self.critic_loss_coef = critic_loss_coef
         self.compile: bool | Literal["auto"] = compile
@@ -163,6 +174,8 @@ class SACFlow(SAC):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        if self.replay_buffer is None:
+            raise ValueError("learn() needs a replay buffer: give env to load_safe to train on")
         # Here and not at construction: a model that is loaded to act needs no demonstrations.
         if self._demonstrations is not None:
             if is_recipe(self._demonstrations):
@@ -311,6 +324,57 @@ class SACFlow(SAC):
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
+
+    def save_safe(self, path: str | Path, vec_normalize: VecNormalize | None = None) -> Path:
+        """Write a safe bundle: one file that can be shared, as loading it executes nothing.
+
+        It holds the policy, target networks, optimisers, temperature, all settings, and the
+        statistics of ``VecNormalize``; not the replay buffer. ``docs/guide/sharing.md`` tells more.
+
+        Args:
+            path: File to write, ``.safetensors`` where it has no suffix.
+            vec_normalize: Statistics to include. Default: those of the model's environment.
+
+        Returns:
+            The file's path.
+
+        Raises:
+            ValueError: If the model has a part that needs code, such as a features extractor of
+                your own or a learning rate that is a function; the message names it.
+
+        Example:
+            >>> import tempfile
+            >>> model = SACFlow("FlowPolicy", "Pendulum-v1")
+            >>> path = model.save_safe(tempfile.mkdtemp() + "/pendulum")
+            >>> SACFlow.load_safe(path).predict(np.zeros(3), deterministic=True)[0].shape
+            (1,)
+        """
+        return save_bundle(self, path, vec_normalize)
+
+    @classmethod
+    def load_safe(
+        cls: type[SelfSACFlow],
+        path: str | Path,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+    ) -> SelfSACFlow:
+        """Read what :meth:`save_safe` wrote, without executing anything the file says.
+
+        Args:
+            path: The file.
+            env: Environment to train on in, as it was before any ``VecNormalize``: if the model
+                has statistics, they are wrapped around it. Default: none, to predict only;
+                observations then go through ``model.normalization`` where that is not None.
+            device: Where the model goes.
+
+        Returns:
+            The model.
+
+        Raises:
+            BundleError: A ``ValueError``, if anything in the file is not as it was written.
+            ValueError: If ``env`` has other spaces.
+        """
+        return load_bundle(cls, path, env, device)
 
     def _excluded_save_params(self) -> list[str]:
         engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned"]

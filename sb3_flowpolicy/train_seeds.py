@@ -76,7 +76,11 @@ def _overrides(pairs: list[str]) -> dict[str, Any]:
         key, separator, value = pair.partition(":")
         if not separator:
             raise ValueError(f"hyperparams must be of the form key:value, got {pair!r}")
-        settings[key] = yaml.safe_load(value)
+        try:
+            settings[key] = yaml.safe_load(value)
+        # Recursion: brackets in brackets in brackets ...
+        except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+            raise ValueError(f"hyperparams must have YAML values, got {pair[:80]!r}") from error
     return settings
 
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from flowpolicy_envs.checks import is_whole
+
 if TYPE_CHECKING:
     import pygame
 
@@ -20,7 +22,7 @@ _SUPERSAMPLING = 3
 
 def check_render_mode(render_mode: str | None, modes: tuple[str, ...]) -> None:
     """Raise ValueError unless `render_mode` is None or one of `modes`."""
-    if render_mode is not None and render_mode not in modes:
+    if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")
 
 
@@ -42,7 +44,7 @@ class Canvas(ABC):
     fps: ClassVar[int] = RENDER_FPS
 
     def __init__(self, size: int) -> None:
-        if not isinstance(size, int | np.integer) or size < 16:
+        if not is_whole(size) or size < 16:
             raise ValueError(f"render_size must be an integer of at least 16, got {size!r}")
         self._size = size
         self._edge = size * _SUPERSAMPLING

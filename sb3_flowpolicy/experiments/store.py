@@ -13,7 +13,6 @@ and ``checkpoints/KEY`` while the item is unfinished.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -109,7 +108,7 @@ class ItemFiles:
             lines.pop()  # it is being written, or the run was interrupted here
         if not lines:
             return []
-        columns = next(csv.reader(lines[:1]))
+        columns = lines[0].rstrip("\n").split(",")  # as append_rows writes it, without quotes
         missing = [name for name in BASIC_COLUMNS if name not in columns]
         if missing:
             raise ValueError(f"{self.table}, line 1 must name the columns {missing}, got {columns}")
@@ -132,11 +131,16 @@ class ItemFiles:
             lines.pop()
         for number, line in enumerate(lines, start=1):
             try:
-                found.append(json.loads(line))
-            except json.JSONDecodeError as error:
+                detail = json.loads(line)
+            except (ValueError, RecursionError) as error:
                 raise ValueError(
                     f"{self.details}, line {number} must be JSON, got {line[:60]!r}: {_ADVICE}"
                 ) from error
+            if not isinstance(detail, dict):
+                raise ValueError(
+                    f"{self.details}, line {number} must be an object, got {line[:60]!r}: {_ADVICE}"
+                )
+            found.append(detail)
         return found
 
     def read_done(self) -> dict[str, Any] | None:
@@ -215,6 +219,8 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} must be JSON, got an error in line {error.lineno}") from error
+    except (ValueError, RecursionError) as error:  # other encodings, a hundred thousand brackets
+        raise ValueError(f"{path} must be JSON, got {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold an object, got {type(content).__name__}")
     return content

@@ -18,6 +18,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
+from sb3_flowpolicy.distributions.base import positive_int
 from sb3_flowpolicy.policies.actor import FlowActor
 
 _SAC_POLICY_KWARGS = set(inspect.signature(SACPolicy.__init__).parameters)
@@ -70,6 +71,11 @@ class DistributionPolicy(SACPolicy):
         if not isinstance(distribution_kwargs, Mapping | None):
             raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
         self.distribution_kwargs = dict(distribution_kwargs or {})
+        if not all(isinstance(name, str) for name in self.distribution_kwargs):
+            raise ValueError(
+                f"distribution_kwargs must have strings as keys, got {distribution_kwargs!r}"
+            )
+        _check_net_arch(sac_policy_kwargs.get("net_arch"))
         unknown = sorted(set(sac_policy_kwargs) - _SAC_POLICY_KWARGS)
         if unknown:
             raise ValueError(
@@ -118,6 +124,23 @@ class DistributionPolicy(SACPolicy):
             share_features_extractor=self.share_features_extractor,
         )
         return data
+
+
+def _check_net_arch(net_arch: Any) -> None:
+    """Raise ``ValueError`` unless these are units per layer; torch's messages would not say."""
+    if net_arch is None:
+        return
+    if isinstance(net_arch, Mapping):
+        if set(net_arch) != {"pi", "qf"}:
+            raise ValueError(f"net_arch must have the keys 'pi' and 'qf', got {list(net_arch)}")
+        archs = list(net_arch.values())
+    else:
+        archs = [net_arch]
+    for arch in archs:
+        if not isinstance(arch, list | tuple):
+            raise ValueError(f"net_arch must be a list of units per layer, got {arch!r}")
+        for units in arch:
+            positive_int("net_arch", units)
 
 
 def check_finite_actions(actions: np.ndarray) -> None:

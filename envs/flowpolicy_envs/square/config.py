@@ -1,13 +1,14 @@
 """The arguments of a Square, checked once for the single and the vectorised environment."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from flowpolicy_envs.checks import check_not_negative, is_number, is_whole
 from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.tasks import FindGoal, Task, as_task
 
@@ -105,18 +106,17 @@ class SquareConfig:
                 least = "at least 0" if zero else "positive"
                 raise ValueError(f"{name} must be {least}, got {getattr(self, name)}")
         for name in ("finger_distance", "finger_noise", "warm_up"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)}")
+            check_not_negative(name, getattr(self, name))
         if self.finger_distance < ranges["size"][1] / 2:
             raise ValueError(
                 f"finger_distance must be at least half the size, {ranges['size'][1] / 2:g}, "
                 f"got {self.finger_distance}: fingers start outside the square"
             )
-        if not 0.0 < self.dt < math.inf:
-            raise ValueError(f"dt must be positive, got {self.dt}")
+        if not is_number(self.dt) or not 0.0 < self.dt < math.inf:
+            raise ValueError(f"dt must be positive, got {self.dt!r}")
         for name in ("stack", "substeps"):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < 1:
+            if not is_whole(value) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
         self._check_stability()
         # Rounded first: 2 s / 0.25 s must not become nine steps.
@@ -187,7 +187,7 @@ def _checked_range(name: str, value: Range) -> tuple[float, float]:
     """Return `value` as the ends of an interval."""
     try:
         ends = np.atleast_1d(np.asarray(value, np.float64))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be a number or [low, high], got {value!r}") from None
     if ends.shape not in ((1,), (2,)) or not np.isfinite(ends).all() or ends[0] > ends[-1]:
         raise ValueError(f"{name} must be a finite number or [low, high], got {value!r}")
@@ -196,10 +196,12 @@ def _checked_range(name: str, value: Range) -> tuple[float, float]:
 
 def _picked(observe: Sequence[str]) -> NDArray[np.int64]:
     """Return which of the 21 features are observed."""
-    if isinstance(observe, str) or not observe or not set(observe) <= set(FEATURES):
+    names = list(observe) if isinstance(observe, Collection) else []
+    known = all(isinstance(name, str) and name in FEATURES for name in names)
+    if isinstance(observe, str) or not names or not known:
         raise ValueError(f"observe must name some of {tuple(FEATURES)}, got {observe!r}")
     every = np.arange(kernels.N_FEATURES)
-    return np.concatenate([every[FEATURES[name]] for name in FEATURES if name in observe])
+    return np.concatenate([every[FEATURES[name]] for name in FEATURES if name in names])
 
 
 def _noise(noise: float | Mapping[str, float]) -> NDArray[np.float64]:
@@ -209,7 +211,6 @@ def _noise(noise: float | Mapping[str, float]) -> NDArray[np.float64]:
     for name, scale in by_name.items():
         if name not in FEATURES:
             raise ValueError(f"observation_noise must be for {tuple(FEATURES)}, got {name!r}")
-        if not 0.0 <= scale < math.inf:
-            raise ValueError(f"observation_noise must be finite and at least 0, got {scale}")
+        check_not_negative("observation_noise", scale)
         scales[FEATURES[name]] = scale
     return scales

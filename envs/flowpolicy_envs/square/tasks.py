@@ -1,11 +1,11 @@
 """What the agent is paid for: one small object per task, every coefficient an argument."""
 
-import math
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowpolicy_envs.checks import check_not_negative
 from flowpolicy_envs.square import kernels
 
 
@@ -29,9 +29,7 @@ class Task:
     def __post_init__(self) -> None:
         """Check the coefficients."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{field.name} must be finite and at least 0, got {value}")
+            check_not_negative(field.name, getattr(self, field.name))
 
     def terms(self) -> NDArray[np.float64]:
         """Return the coefficients as the compiled reward reads them, (11,)."""
@@ -167,6 +165,6 @@ def as_task(task: "Task | str") -> Task:
     """
     if isinstance(task, Task):
         return task
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task must be a Task or one of {tuple(TASKS)}, got {task!r}")
     return TASKS[task]()

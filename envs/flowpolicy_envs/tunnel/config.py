@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from flowpolicy_envs.checks import check_not_negative, is_number, is_whole
 from flowpolicy_envs.tunnel.kernels import CIRCLE
 from flowpolicy_envs.tunnel.paths import (
     DEFAULT_WAYPOINTS,
@@ -56,7 +57,7 @@ class TunnelConfig:
 
     def __post_init__(self) -> None:
         """Check the arguments and build the path."""
-        if self.path not in PATHS:
+        if not isinstance(self.path, str) or self.path not in PATHS:
             raise ValueError(f"path must be one of {PATHS}, got {self.path!r}")
         _check_range("width", self.width, 0.0, 2.0)
         _check_range("reach", self.reach, 0.0, 2.0)
@@ -64,11 +65,9 @@ class TunnelConfig:
         _check_range("radius", self.radius, 0.0, 1.0)
         _check_dims(self)
         for name in ("dense_reward", "leave_penalty", "start_noise"):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} must be finite and at least 0, got {value}")
-        if not math.isfinite(self.goal_reward):
-            raise ValueError(f"goal_reward must be finite, got {self.goal_reward}")
+            check_not_negative(name, getattr(self, name))
+        if not is_number(self.goal_reward) or not math.isfinite(self.goal_reward):
+            raise ValueError(f"goal_reward must be finite, got {self.goal_reward!r}")
         # The one way round a dataclass's own freeze: this attribute follows from the others.
         object.__setattr__(self, "geometry", self._build_path())
         to_goal = self.geometry.locate(self.geometry.point(0.0))[1]
@@ -109,8 +108,8 @@ class TunnelConfig:
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
-    if not low < value <= high:
-        raise ValueError(f"{name} must be in ({low:g}, {high:g}], got {value}")
+    if not is_number(value) or not low < value <= high:
+        raise ValueError(f"{name} must be in ({low:g}, {high:g}], got {value!r}")
 
 
 def _check_dims(config: TunnelConfig) -> None:
@@ -121,7 +120,7 @@ def _check_dims(config: TunnelConfig) -> None:
         ("coupled_dims", coupled, 1),
         ("free_dims", free, 0),
     ):
-        if not isinstance(count, int | np.integer) or count < least:
+        if not is_whole(count) or count < least:
             raise ValueError(f"{name} must be an integer of at least {least}, got {count!r}")
     if config.path != "line" and (total, coupled, free) != (2, 2, 0):
         raise ValueError(

@@ -1,0 +1,227 @@
+"""Policies as ONNX files, with everything that acts between sensor and motor."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import VecNormalize
+
+import sb3_flowpolicy
+from sb3_flowpolicy.bundle.normalization import Normalization, normalization_of
+from sb3_flowpolicy.export.deployed import DeployedPolicy, expected_actions, random_inputs
+from sb3_flowpolicy.policies import DistributionPolicy, FlowActor
+
+FORMAT = "sb3_flowpolicy.onnx.1"
+#: The greatest difference to ``predict`` that is let pass, relative to the actions' range.
+TOLERANCE = 1e-5
+_N_CHECKED = 64
+
+
+def export_onnx(
+    model: SAC,
+    path: str | Path,
+    *,
+    stochastic: bool = False,
+    vec_normalize: VecNormalize | None = None,
+) -> Path:
+    """Write a policy as an ONNX file that needs neither torch nor this package to run.
+
+    The graph takes raw observations of the environment and returns actions in its units, both
+    with a leading batch axis: normalisation and clipping of ``VecNormalize``, the policy, tanh and
+    rescaling are inside. The file is run once with onnxruntime, and compared with ``predict``,
+    before it gets its name.
+
+    Args:
+        model: ``SACFlow``, or SB3's ``SAC`` with one of our policies.
+        path: File to write, ``.onnx`` where it has no suffix.
+        stochastic: Whether the file can also sample: noise is then a further input ``noise`` of
+            independent standard normals, (batch, M), and ``sampled_action`` a further output.
+        vec_normalize: Statistics to build in. Default: those of the model's environment, or of
+            the bundle that it was loaded from.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ValueError: If the policy is not one of ours, or explores with gSDE.
+        ModuleNotFoundError: If the extra ``[export]`` is not installed.
+        RuntimeError: If the file's actions are not the model's.
+
+    Example:
+        >>> import tempfile
+        >>> from sb3_flowpolicy import SACFlow
+        >>> model = SACFlow("FlowPolicy", "Pendulum-v1")
+        >>> path = export_onnx(model, tempfile.mkdtemp() + "/pendulum")
+        >>> import numpy as np
+        >>> import onnxruntime
+        >>> session = onnxruntime.InferenceSession(path)
+        >>> (action,) = session.run(["action"], {"obs": np.zeros((5, 3), np.float32)})
+        >>> action.shape
+        (5, 1)
+    """
+    policy = model.policy
+    if not isinstance(policy, DistributionPolicy) or not isinstance(policy.actor, FlowActor):
+        raise ValueError(
+            "model must have a policy of sb3_flowpolicy with use_sde=False, got "
+            f"{type(policy).__name__} with an actor of type {type(policy.actor).__name__}"
+        )
+    normalization = normalization_of(model, vec_normalize)
+    deployed = DeployedPolicy(policy, normalization, stochastic).cpu().eval()
+    names = [*deployed.input_names(), *deployed.output_names()]
+    if len(set(names)) < len(names):
+        raise ValueError(f"observation_space must have keys other than {names[-3:]}, got {names}")
+    inputs = random_inputs(policy, stochastic, _N_CHECKED, np.random.default_rng(0))
+    proto = _translate(deployed, [th.from_numpy(array[:2]) for array in inputs])
+    _describe(proto, model, normalization, stochastic)
+    content = proto.SerializeToString()
+    _check(content, deployed, inputs, expected_actions(policy, normalization, inputs))
+    path = Path(path)
+    path = path if path.suffix else path.with_suffix(".onnx")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
+    with os.fdopen(handle, "wb") as file:
+        file.write(content)
+    os.chmod(temporary, 0o644)  # mkstemp's files are for their owner alone
+    os.replace(temporary, path)
+    return path
+
+
+def _translate(deployed: DeployedPolicy, example: list[th.Tensor]) -> Any:
+    batch = th.export.Dim("batch", min=1)
+    with _quietly():
+        program = th.onnx.export(
+            deployed,
+            tuple(example),
+            input_names=deployed.input_names(),
+            output_names=deployed.output_names(),
+            dynamic_shapes={"inputs": tuple({0: batch} for _ in example)},
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+    assert program is not None
+    proto = program.model_proto
+    # Where the exporter found each operation: paths of this machine, and half of the file.
+    graph = proto.graph
+    for part in (*graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    graph.ClearField("doc_string")
+    return proto
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep the exporter's progress and its remarks on torch's own code to itself."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        logger = logging.getLogger("torch.onnx")
+        level = logger.level
+        logger.setLevel("ERROR")
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
+
+
+def _describe(
+    proto: Any, model: SAC, normalization: Normalization | None, stochastic: bool
+) -> None:
+    """Write into the file what somebody who has only the file needs to know."""
+    policy: Any = model.policy
+    facts: dict[str, Any] = {
+        "format": FORMAT,
+        "policy": type(policy).__name__,
+        "distribution": policy.distribution,
+        "num_timesteps": model.num_timesteps,
+        "observation_space": describe_space(model.observation_space),
+        "action_space": describe_space(model.action_space),
+        "vec_normalize": "inside" if normalization is not None else "none",
+        "made_with": {
+            "sb3_flowpolicy": sb3_flowpolicy.__version__,
+            "stable_baselines3": stable_baselines3.__version__,
+            "torch": str(th.__version__),
+        },
+    }
+    if stochastic:
+        facts["noise"] = {
+            "input": "noise",
+            "shape": ["batch", policy.actor.density.noise_dim],
+            "draw": "independent standard normals, anew for each action",
+        }
+    for key, value in facts.items():
+        entry = proto.metadata_props.add()
+        entry.key, entry.value = key, value if isinstance(value, str) else json.dumps(value)
+
+
+def describe_space(space: spaces.Space) -> dict[str, Any]:
+    """Say in JSON what a space is; bounds that are all the same, as one number.
+
+    Example:
+        >>> describe_space(spaces.Box(-1, 1, (2,)))
+        {'type': 'Box', 'dtype': 'float32', 'shape': [2], 'low': -1.0, 'high': 1.0}
+    """
+    if isinstance(space, spaces.Dict):
+        entries = {key: describe_space(part) for key, part in space.spaces.items()}
+        return {"type": "Dict", "spaces": entries}
+    facts: dict[str, Any] = {
+        "type": type(space).__name__,
+        "dtype": str(space.dtype),
+        "shape": list(space.shape or ()),
+    }
+    if isinstance(space, spaces.Box):
+        facts.update(low=_bounds(space.low), high=_bounds(space.high))
+    elif isinstance(space, spaces.Discrete):
+        facts["n"] = int(space.n)
+    elif isinstance(space, spaces.MultiDiscrete):
+        facts["nvec"] = space.nvec.tolist()
+    return facts
+
+
+def _bounds(bounds: np.ndarray) -> Any:
+    same = bounds.size > 0 and (bounds == bounds.flat[0]).all()
+    # JSON has no infinity.
+    words = np.where(np.isfinite(bounds), bounds.astype(object), bounds.astype(str))
+    return words.flat[0] if same else words.tolist()
+
+
+def _check(
+    content: bytes,
+    deployed: DeployedPolicy,
+    inputs: list[np.ndarray],
+    expected: list[np.ndarray],
+) -> None:
+    """Run the file, at more than one batch size.
+
+    Raises:
+        RuntimeError: If it does not do what the model does.
+    """
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    span = deployed.get_buffer("span").numpy().max()
+    for n in (1, len(inputs[0])):
+        feed = dict(zip(deployed.input_names(), (array[:n] for array in inputs), strict=True))
+        for name, got, wanted in zip(
+            deployed.output_names(), session.run(None, feed), expected, strict=True
+        ):
+            gap = np.abs(got - wanted[:n]).max()
+            if not gap <= TOLERANCE * max(1.0, span):
+                raise RuntimeError(
+                    f"{name} of the ONNX file must be the model's to {TOLERANCE:g} of the "
+                    f"actions' range, got a difference of {gap:.3g}"
+                )

@@ -1,0 +1,156 @@
+"""What the settings of an agent may be: one table, for the constructor and for files."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from stable_baselines3.common.type_aliases import TrainFreq
+
+#: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
+Check = Callable[[str, Any], Any]
+
+
+def integer(least: int, most: int = 2**53) -> Check:
+    """Accept integers from ``least`` to ``most``, not booleans."""
+
+    def check(name: str, value: Any) -> int:
+        whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+        if not whole or not least <= value <= most:
+            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+        return int(value)
+
+    return check
+
+
+def number(least: float = -math.inf, most: float = math.inf, above: bool = False) -> Check:
+    """Accept finite numbers from ``least`` (or ``above`` it) to ``most``, not booleans."""
+
+    def check(name: str, value: Any) -> float:
+        if not is_number(value):
+            raise ValueError(f"{name} must be a number, got {value!r}")
+        if not (math.isfinite(value) and least <= value) or (above and value == least):
+            bound = (
+                "finite" if least == -math.inf else f"{'above' if above else 'at least'} {least:g}"
+            )
+            raise ValueError(f"{name} must be {bound}, got {value}")
+        if value > most:
+            raise ValueError(f"{name} must be at most {most:g}, got {value}")
+        return int(value) if isinstance(value, numbers.Integral) else float(value)
+
+    return check
+
+
+def flag(name: str, value: Any) -> bool:
+    """Accept True and False."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return value
+
+
+def optional(check: Check) -> Check:
+    """Accept None, too."""
+    return lambda name, value: None if value is None else check(name, value)
+
+
+def either(choice: str, check: Check) -> Check:
+    """Accept one word, too."""
+    return lambda name, value: (
+        choice if isinstance(value, str) and value == choice else check(name, value)
+    )
+
+
+def is_number(value: Any) -> bool:
+    """Whether this is a real number that floats can hold: no boolean, no array."""
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    try:
+        float(value)
+    except OverflowError:
+        return False
+    return True
+
+
+def temperature(name: str, value: Any) -> str | float:
+    """Accept a number, ``"auto"``, or ``"auto_0.1"`` with the value to begin with."""
+    if not isinstance(value, str):
+        return number()(name, value)
+    word, mark, start = value.partition("_")
+    try:
+        if word == "auto" and (not mark or 0 < float(start) < math.inf):
+            return value
+    except ValueError:
+        pass
+    raise ValueError(f'{name} must be a number, "auto" or "auto_0.1", got {value!r}')
+
+
+def train_frequency(name: str, value: Any) -> int | tuple[int, str]:
+    """Accept a number of steps, or a pair such as ``(1, "episode")``."""
+    if not isinstance(value, tuple):
+        return integer(1)(name, value)
+    unit: Any = value[1] if len(value) == 2 else None
+    if isinstance(value, TrainFreq):
+        unit = value.unit.value
+    if unit not in ("step", "episode"):
+        raise ValueError(f'{name} must be an integer or (integer, "step" | "episode"), got {value}')
+    return integer(1)(name, value[0]), unit
+
+
+def mapping(name: str, value: Any) -> Mapping[str, Any]:
+    """Accept dicts with strings as keys."""
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise ValueError(f"{name} must be a dict with strings as keys, got {value!r}")
+    return value
+
+
+#: What an agent is, in plain values. A bundle holds all of these, and the constructor checks them.
+SETTINGS: dict[str, Check] = {
+    "buffer_size": integer(1),
+    "learning_starts": number(0),
+    "batch_size": integer(1),
+    "tau": number(0, 1),
+    "gamma": number(0, 1),
+    "train_freq": train_frequency,
+    "gradient_steps": integer(-1),
+    "optimize_memory_usage": flag,
+    "n_steps": integer(1),
+    "ent_coef": temperature,
+    "target_update_interval": integer(1),
+    "target_entropy": either("auto", number()),
+    "use_sde": flag,
+    "sde_sample_freq": integer(-1),
+    "use_sde_at_warmup": flag,
+    "stats_window_size": integer(1),
+    "seed": optional(integer(0, 2**32 - 1)),
+    "random_steps": optional(number(0)),
+    "critic_loss_coef": number(0, above=True),
+    "compile": either("auto", flag),
+    "autocast": flag,
+}
+
+# Arguments of the constructor that are no part of the agent, or no plain values.
+_FURTHER: dict[str, Check] = {
+    "policy_kwargs": optional(mapping),
+    "replay_buffer_kwargs": optional(mapping),
+    "verbose": integer(0),
+}
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Check those arguments of SACFlow that are known here.
+
+    Raises:
+        ValueError: If one is of another type or out of range; the message names it.
+
+    Example:
+        >>> check_settings({"gamma": 0.9, "policy_kwargs": {}})
+        >>> check_settings({"gamma": "high"})
+        Traceback (most recent call last):
+        ...
+        ValueError: gamma must be a number, got 'high'
+    """
+    for name, check in {**SETTINGS, **_FURTHER}.items():
+        if name in settings:
+            check(name, settings[name])
