@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
+    from sb3_flowpolicy.finite import NonFiniteError
     from sb3_flowpolicy.policies import (
         CnnFlowPolicy,
         CnnGaussPolicy,
@@ -37,6 +38,7 @@ __all__ = [
     "MultiInputFlowPolicy",
     "MultiInputGaussPolicy",
     "MultiInputLowRankPolicy",
+    "NonFiniteError",
     "SACFlow",
     "SeedBatch",
     "register_distribution",
@@ -44,6 +46,7 @@ __all__ = [
 
 _ELSEWHERE = {
     "ActionDistribution": "distributions",
+    "NonFiniteError": "finite",
     "SACFlow": "sac_flow",
     "SeedBatch": "seed_batch",
     "register_distribution": "distributions",

@@ -9,6 +9,8 @@ import torch as th
 from torch import nn
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+# A point this many standard deviations away has a log-density that float32 can still hold.
+FARTHEST = 1e18
 
 
 class ActionDistribution(nn.Module, ABC):
@@ -107,6 +109,11 @@ class ActionDistribution(nn.Module, ABC):
 def standard_normal_log_prob(noise: th.Tensor) -> th.Tensor:
     """Log-density of a standard normal, summed over the last dimension: (..., M) -> (...)."""
     return -(0.5 * noise.square() + LOG_SQRT_2PI).sum(-1)
+
+
+def score_standard_normal(point: th.Tensor) -> th.Tensor:
+    """Log-density at a given point: farther out than ``FARTHEST`` as low as there, not infinite."""
+    return standard_normal_log_prob(point.clamp(-FARTHEST, FARTHEST))
 
 
 def soft_bound(value: th.Tensor, bound: float) -> th.Tensor:
