@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -51,6 +52,8 @@ class TrainingGuard:
     def __init__(self, models: Sequence[SAC], seeds: Sequence[int] | None = None) -> None:
         self.models = models
         self.seeds = seeds
+        #: Folder of the checkpoints that are being written, to be named in messages.
+        self.resume_from: str | Path | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -155,6 +158,8 @@ class TrainingGuard:
         message = f"{name} must be finite, got {value} ({who}step {model.num_timesteps}) {when}. "
         if restored is not None:
             message += f"Weights and optimizers are back at update {restored}. "
+        if self.resume_from is not None:
+            message += f"resume({str(self.resume_from)!r}, env) goes on from the last checkpoint. "
         message += "Look for extreme rewards and observations, or lower the learning rate"
         raise NonFiniteError(
             message, name, value, model.num_timesteps, update, seed, summary, restored

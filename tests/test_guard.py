@@ -263,6 +263,17 @@ def test_learn_does_not_end_with_a_hidden_infinity(where: str) -> None:
         model.learn(5, reset_num_timesteps=False)
 
 
+def test_checkpoints_are_mentioned_where_there_are_some() -> None:
+    model = trained()
+    spoil(model, "rewards", slice(None), np.nan)  # type: ignore[arg-type]
+    with pytest.raises(NonFiniteError) as caught:
+        model.train(1, batch_size=16)
+    assert "resume" not in str(caught.value)
+    model._guard.resume_from = "runs/tunnel"
+    with pytest.raises(NonFiniteError, match=r"resume\('runs/tunnel', env\) goes on from the last"):
+        model.train(1, batch_size=16)
+
+
 def test_parameters_are_looked_at_every_thousand_updates(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = []
     look = TrainingGuard.look

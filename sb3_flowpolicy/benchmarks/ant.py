@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -29,7 +30,7 @@ POLICIES = {
 }
 # rl_zoo3 2.9.2, hyperparams/sac.yml. Ours: learning_starts, 10 000 there, so that nearly all of a
 # short run are updates.
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "learning_rate": 7.3e-4,
     "buffer_size": 300_000,
     "batch_size": 256,
