@@ -9,8 +9,9 @@ import torch as th
 from torch import nn
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-# A point this many standard deviations away has a log-density that float32 can still hold.
-FARTHEST = 1e18
+# Points up to this many standard deviations away have log-densities and gradients that fit into
+# float32.
+FARTHEST = 1e12
 
 
 class ActionDistribution(nn.Module, ABC):
