@@ -15,7 +15,7 @@ from sb3_flowpolicy.finite import NonFiniteError
 
 # Losses tell of most mischief at once. An infinity that a relu or a clamp hides from them is found
 # at the next look at everything, which takes about as long as one update of small networks.
-UPDATES_BETWEEN_LOOKS = 1000
+UPDATES_BETWEEN_LOOKS = 2000
 # Ordinary rewards and observations are far below; worth pointing at when training has failed.
 _EXTREME = 1e6
 # Name in messages -> field of the engine's minibatch, attribute of SB3's replay buffer.
@@ -30,10 +30,10 @@ _COLUMNS = {
 class TrainingGuard:
     """Watches losses, parameters and optimisers of S agents that are trained in lockstep.
 
-    Every 1000th update it makes sure that all parameters and optimiser states are finite, and
+    Every 2000th update it makes sure that all parameters and optimiser states are finite, and
     remembers them. After every call of ``train()`` it looks at the losses. If anything is not
     finite it puts back what it remembers, in all agents, and raises :class:`NonFiniteError`: the
-    agents are left as they were at most 1000 updates before, and can be used and saved.
+    agents are left as they were at most 2000 updates before, and can be used and saved.
 
     Args:
         models: The agents, equally many updates old.
@@ -90,41 +90,45 @@ class TrainingGuard:
 
     def after_updates(
         self,
-        losses: Mapping[str, Sequence[float]],
+        names: Sequence[str],
+        losses: Sequence[Sequence[float]],
         history: Sequence[th.Tensor] = (),
         batches: Sequence[Any] = (),
     ) -> None:
         """Look at the losses of the updates that were just done.
 
         Args:
-            losses: Name -> mean over these updates, for each of the S agents.
-            history: Per update, the same losses, (len(losses), S); nothing where not known.
-            batches: Per update, its minibatches (``engine.update.Batch``).
+            names: Names of the losses.
+            losses: Their means over these updates, (len(names), S).
+            history: The losses of each update, (len(names), S); nothing where not known.
+            batches: The minibatches of each update (``engine.update.Batch``).
 
         Raises:
             NonFiniteError: If one of them is not finite.
         """
-        for name, values in losses.items():
+        if math.isfinite(sum(map(sum, losses))):  # asked after every update: in one go
+            return
+        for name, values in zip(names, losses, strict=True):
             for index, value in enumerate(values):
                 if not math.isfinite(value):
-                    self._blame(losses, name, index, history, batches)
+                    self._blame(names, name, value, index, history, batches)
 
     def _blame(
         self,
-        losses: Mapping[str, Sequence[float]],
+        names: Sequence[str],
         name: str,
+        value: float,
         index: int,
         history: Sequence[th.Tensor],
         batches: Sequence[Any],
     ) -> NoReturn:
         """Find out where it began, for it spreads to all losses within two updates, and stop."""
-        value, update = losses[name][index], None
-        when, where = "in the last updates", "replay buffer"
+        update, when, where = None, "in the last updates", "replay buffer"
         all_losses = th.stack(list(history)) if history else th.empty(0)
         bad = (~all_losses.isfinite()).nonzero()
         if len(bad):
             k, row, index = bad[0].tolist()
-            name, value = list(losses)[row], all_losses[k, row, index].item()
+            name, value = names[row], all_losses[k, row, index].item()
             update = self.models[index]._n_updates - len(history) + k + 1
             when, where = f"in update {update}", "minibatch"
             columns = {

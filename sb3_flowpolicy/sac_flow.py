@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -244,18 +244,17 @@ class SACFlow(SAC):
             n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
             self._guard.before_updates()
             batches = engine.draw(n_updates, batch_size)
-            losses = engine.train(batches, start)
+            losses = engine.train(batches, start).tolist()
             self._n_updates += n_updates
-            means = dict(zip(LOSSES, losses.tolist(), strict=True))
-            self._guard.after_updates(means, engine.history, batches)
+            self._guard.after_updates(LOSSES, losses, engine.history, batches)
             self.record_losses(losses)
 
-    def record_losses(self, losses: th.Tensor, seed: int = 0) -> None:
-        """Record what SB3's ``train`` records: the engine's losses (4, S), of one seed."""
+    def record_losses(self, losses: Sequence[Sequence[float]], seed: int = 0) -> None:
+        """Record what SB3's ``train`` records: the engine's losses, (4, S), of one seed."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for key, value in zip(LOSSES, losses[:, seed].tolist(), strict=True):
+        for key, values in zip(LOSSES, losses, strict=True):
             if key != "ent_coef_loss" or self.ent_coef_optimizer is not None:
-                self.logger.record(f"train/{key}", value)
+                self.logger.record(f"train/{key}", values[seed])
 
     def _ready_engine(self) -> Engine | None:
         """Return an engine that fits the model's present settings, None if there can be none."""
@@ -310,8 +309,8 @@ class SACFlow(SAC):
         logged = self.logger.name_to_value
         logged["train/critic_loss"] *= factor
         # The critics first: means over several updates do not tell which loss was the first.
-        losses = sorted(LOSSES, key="critic_loss".__ne__)
-        self._guard.after_updates({key: [logged.get(f"train/{key}", 0.0)] for key in losses})
+        names = sorted(LOSSES, key="critic_loss".__ne__)
+        self._guard.after_updates(names, [[logged.get(f"train/{name}", 0.0)] for name in names])
 
     def _planned_updates(self, total_timesteps: int) -> float:
         """Count the updates that are still to come, roughly where episodes decide."""

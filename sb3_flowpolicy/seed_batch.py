@@ -98,7 +98,7 @@ class SeedBatch:
             self._models, self.seeds, self._before_dump, monitor_dir, info_keywords
         )
         self._guard = TrainingGuard(models, seeds)
-        self._losses: th.Tensor | None = None
+        self._losses: list[list[float]] | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
         self._noise = self._make_noise()
@@ -356,11 +356,10 @@ class SeedBatch:
         rows = self._noise["rows"].draw_many(first.gradient_steps)
         noise = self._noise["updates"].draw_many(first.gradient_steps).transpose(1, 2)
         batches = self._storage.gather(rows, first.gamma, noise)
-        self._losses = self._engine.train(batches)
+        self._losses = self._engine.train(batches).tolist()
         for model in self._models:
             model._n_updates += first.gradient_steps
-        means = dict(zip(LOSSES, self._losses.tolist(), strict=True))
-        self._guard.after_updates(means, self._engine.history, batches)
+        self._guard.after_updates(LOSSES, self._losses, self._engine.history, batches)
 
     def _before_dump(self, seed: int) -> None:
         """Record what SB3 records at each update only now that somebody reads it."""

@@ -274,7 +274,7 @@ def test_checkpoints_are_mentioned_where_there_are_some() -> None:
         model.train(1, batch_size=16)
 
 
-def test_parameters_are_looked_at_every_thousand_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_are_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = []
     look = TrainingGuard.look
     monkeypatch.setattr(

@@ -1,17 +1,27 @@
-"""What it costs to be careful: the training guard, and the ways to choose an action."""
+"""What it costs to be careful: the training guard, and the ways to choose an action.
+
+Contests for ``benchmarks.throughput``. With and without the guard differ by less than turns on a
+busy machine do; ``python -m sb3_flowpolicy.benchmarks.trust`` therefore times each call of the
+guard where it happens, between updates, and prints what share of a step it is.
+"""
 
 from __future__ import annotations
 
+import statistics
+import time
 from functools import cached_property
 from typing import Any
 from unittest import mock
 
 import numpy as np
+import torch as th
 
 import flowpolicy_envs
+from sb3_flowpolicy import sac_flow, seed_batch
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 from sb3_flowpolicy.benchmarks.updates import Unmoved
 from sb3_flowpolicy.benchmarks.zoo_blocks import zoo_block
+from sb3_flowpolicy.guard import TrainingGuard
 from sb3_flowpolicy.policies import DistributionPolicy
 from sb3_flowpolicy.policies.deterministic import MODES
 from sb3_flowpolicy.sac_flow import SACFlow
@@ -112,3 +122,57 @@ def _acting(mode: str, size: int) -> Work:
         return 1.0
 
     return act
+
+
+def main() -> None:
+    """Print the guard's share of the time of a step, call by call."""
+    th.set_num_threads(1)
+    for kind in ("SACFlow", f"SeedBatch of {N_SEEDS}"):
+        turns = _Turns(kind, quick=False)
+        turns.watched()
+        seconds = []
+        for _ in range(5):
+            start = time.process_time()
+            turns.watched()
+            seconds.append(time.process_time() - start)
+        step = statistics.median(seconds) / turns.chunk
+        print(f"{kind}: {step * 1e6:.0f} us of CPU time per step, compiled")
+        total = 0.0
+        for name, times in _time_calls(turns).items():
+            share = statistics.median(times) * len(times) / turns.chunk / step
+            total += share
+            print(
+                f"  {name:16} median {statistics.median(times) * 1e6:7.1f} us, "
+                f"{len(times) / turns.chunk:.3f} per step: {share:.2%}"
+            )
+        print(f"  together {total:.2%}", flush=True)
+
+
+def _time_calls(turns: _Turns) -> dict[str, list[float]]:
+    """Time the calls of the guard during one chunk; preempted ones do not move the median."""
+    found: dict[str, list[float]] = {}
+
+    def timed(owner: Any, name: str) -> Any:
+        function = getattr(owner, name)
+
+        def call(*arguments: Any) -> Any:
+            before, start = time.perf_counter(), time.perf_counter()
+            result = function(*arguments)
+            # Less what it takes to look at the clock.
+            found.setdefault(name, []).append(time.perf_counter() - start - (start - before))
+            return result
+
+        return mock.patch.object(owner, name, call)
+
+    with (
+        timed(sac_flow, "check_step"),
+        timed(seed_batch, "check_experience"),
+        timed(TrainingGuard, "before_updates"),
+        timed(TrainingGuard, "after_updates"),
+    ):
+        turns.watched()
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -18,7 +18,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
-from sb3_flowpolicy.finite import check_observation
+from sb3_flowpolicy.finite import all_finite, check_observation
 from sb3_flowpolicy.policies.actor import FlowActor
 from sb3_flowpolicy.policies.deterministic import (
     DETERMINISTIC_DEFAULTS,
@@ -159,7 +159,7 @@ class DistributionPolicy(SACPolicy):
 
 def check_finite_actions(actions: np.ndarray) -> None:
     """Raise ``ValueError`` rather than send NaN to an environment, as stock SAC does."""
-    if np.isnan(actions).any():
+    if not all_finite(actions):
         raise ValueError(
             "observation and weights must be finite for an action to be, got actions with NaN"
         )
