@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sb3_flowpolicy.bundle import BundleError
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
     from sb3_flowpolicy.export import export_onnx
+    from sb3_flowpolicy.finite import NonFiniteError
     from sb3_flowpolicy.policies import (
         CnnFlowPolicy,
         CnnGaussPolicy,
@@ -40,6 +41,7 @@ __all__ = [
     "MultiInputFlowPolicy",
     "MultiInputGaussPolicy",
     "MultiInputLowRankPolicy",
+    "NonFiniteError",
     "SACFlow",
     "SeedBatch",
     "export_onnx",
@@ -49,6 +51,7 @@ __all__ = [
 _ELSEWHERE = {
     "ActionDistribution": "distributions",
     "BundleError": "bundle",
+    "NonFiniteError": "finite",
     "SACFlow": "sac_flow",
     "SeedBatch": "seed_batch",
     "export_onnx": "export",

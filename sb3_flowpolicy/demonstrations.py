@@ -16,6 +16,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_flowpolicy.finite import all_finite
+
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
 
 
@@ -145,7 +147,7 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     for key in ("terminations", "truncations"):
         arrays[key] = arrays[key].astype(bool)
     for key, array in arrays.items():
-        if not np.isfinite(array).all():
+        if not all_finite(array):
             raise ValueError(f"demonstrations must be finite, got NaN or infinity in {key}")
     lengths = {key: len(array) if array.ndim else 0 for key, array in arrays.items()}
     if len(set(lengths.values())) > 1 or not lengths["actions"]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import inspect
-import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -28,7 +28,10 @@ from sb3_flowpolicy.demonstrations import (
     load_demonstrations,
 )
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
-from sb3_flowpolicy.policies.sac import check_finite_actions
+from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
+from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.policies.deterministic import DETERMINISTIC_DEFAULTS
+from sb3_flowpolicy.policies.sac import DistributionPolicy, check_finite_actions
 from sb3_flowpolicy.settings import check_settings
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
@@ -134,6 +137,7 @@ class SACFlow(SAC):
         self._planned = 0.0
         self._engine: Engine | None = None
         self._engine_refused = False
+        self._guard = TrainingGuard([self])
         self._demonstrations: Any = (
             demonstrations
             if demonstrations is None or is_recipe(demonstrations)
@@ -187,6 +191,10 @@ class SACFlow(SAC):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._guard.restart()
+        normalized = self._vec_normalize_env is not None
+        first = self._last_original_obs if normalized else self._last_obs
+        check_experience({"observations": first}, self.num_timesteps, ENVIRONMENT)
         # Many short calls of learn(), with tests in between say, are a long run as well.
         self._planned += self._planned_updates(total_timesteps)
         self._worth_compiling = self._planned >= UPDATES_WORTH_COMPILING
@@ -213,6 +221,21 @@ class SACFlow(SAC):
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
 
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        seen, earned = new_obs, reward
+        if self._vec_normalize_env is not None:  # which would clip infinity
+            seen, earned = self._vec_normalize_env.old_obs, self._vec_normalize_env.old_reward
+        check_step(seen, earned, dones, infos, self.num_timesteps)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Do ``gradient_steps`` updates with minibatches of ``batch_size`` transitions.
 
@@ -232,25 +255,19 @@ class SACFlow(SAC):
         # Minibatches are drawn for many updates at once, but not for all of an offline run.
         for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
             n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
-            losses = engine.train(engine.draw(n_updates, batch_size), start)
+            self._guard.before_updates()
+            batches = engine.draw(n_updates, batch_size)
+            losses = engine.train(batches, start).tolist()
             self._n_updates += n_updates
+            self._guard.after_updates(LOSSES, losses, engine.history, batches)
             self.record_losses(losses)
 
-    def record_losses(self, losses: th.Tensor, seed: int = 0) -> None:
-        """Record what SB3's ``train`` records: the engine's losses (4, S), of one seed.
-
-        Raises:
-            ValueError: If one of them is not finite.
-        """
+    def record_losses(self, losses: Sequence[Sequence[float]], seed: int = 0) -> None:
+        """Record what SB3's ``train`` records: the engine's losses, (4, S), of one seed."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for key, value in zip(LOSSES, losses[:, seed].tolist(), strict=True):
-            if not math.isfinite(value):
-                raise ValueError(
-                    f"{key} must be finite, got {value} at step {self.num_timesteps}: look for NaN "
-                    "in observations and rewards, or lower the learning rate"
-                )
+        for key, values in zip(LOSSES, losses, strict=True):
             if key != "ent_coef_loss" or self.ent_coef_optimizer is not None:
-                self.logger.record(f"train/{key}", value)
+                self.logger.record(f"train/{key}", values[seed])
 
     def _ready_engine(self) -> Engine | None:
         """Return an engine that fits the model's present settings, None if there can be none."""
@@ -296,12 +313,17 @@ class SACFlow(SAC):
                     if parameter.grad is not None:
                         parameter.grad.mul_(factor)
 
+        self._guard.before_updates()
         hook = self.critic.optimizer.register_step_pre_hook(scale_gradient)
         try:
             super().train(gradient_steps, batch_size)
         finally:
             hook.remove()
-        self.logger.name_to_value["train/critic_loss"] *= factor
+        logged = self.logger.name_to_value
+        logged["train/critic_loss"] *= factor
+        # The critics first: means over several updates do not tell which loss was the first.
+        names = sorted(LOSSES, key="critic_loss".__ne__)
+        self._guard.after_updates(names, [[logged.get(f"train/{name}", 0.0)] for name in names])
 
     def _planned_updates(self, total_timesteps: int) -> float:
         """Count the updates that are still to come, roughly where episodes decide."""
@@ -320,10 +342,29 @@ class SACFlow(SAC):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSACFlow:
-        """Train as SB3's ``SAC.learn`` does; same arguments, same return value."""
-        return super().learn(
+        """Train as SB3's ``SAC.learn`` does; same arguments, same return value.
+
+        Raises:
+            NonFiniteError: If the environment hands out, or training arrives at, NaN or infinity;
+                see :class:`~sb3_flowpolicy.guard.TrainingGuard`.
+        """
+        super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
+        self._guard.look()
+        return self
+
+    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
+        """Save as SB3 does; a ``deterministic_mode`` that was set later on is saved as well."""
+        self._note_policy_settings()
+        super().save(path, exclude, include)
+
+    def _note_policy_settings(self) -> None:
+        if isinstance(self.policy, DistributionPolicy):
+            before = {**DETERMINISTIC_DEFAULTS, **self.policy_kwargs}
+            now = self.policy.deterministic_settings()
+            changed = {key: value for key, value in now.items() if value != before[key]}
+            self.policy_kwargs = {**self.policy_kwargs, **changed}
 
     def save_safe(self, path: str | Path, vec_normalize: VecNormalize | None = None) -> Path:
         """Write a safe bundle: one file that can be shared, as loading it executes nothing.
@@ -349,6 +390,7 @@ class SACFlow(SAC):
             >>> SACFlow.load_safe(path).predict(np.zeros(3), deterministic=True)[0].shape
             (1,)
         """
+        self._note_policy_settings()
         return save_bundle(self, path, vec_normalize)
 
     @classmethod
@@ -377,5 +419,5 @@ class SACFlow(SAC):
         return load_bundle(cls, path, env, device)
 
     def _excluded_save_params(self) -> list[str]:
-        engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned"]
+        engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned", "_guard"]
         return [*super()._excluded_save_params(), "_demonstrations", *engine]

@@ -14,8 +14,10 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.engine import Engine, settings_key
+from sb3_flowpolicy.engine import LOSSES, Engine, settings_key
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
+from sb3_flowpolicy.finite import check_experience
+from sb3_flowpolicy.guard import TrainingGuard
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
 from sb3_flowpolicy.seed_checkpoint import read_batch, write_batch
@@ -95,7 +97,8 @@ class SeedBatch:
         self._episodes = SeedEpisodes(
             self._models, self.seeds, self._before_dump, monitor_dir, info_keywords
         )
-        self._losses: th.Tensor | None = None
+        self._guard = TrainingGuard(models, seeds)
+        self._losses: list[list[float]] | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
         self._noise = self._make_noise()
@@ -142,6 +145,10 @@ class SeedBatch:
 
         Returns:
             Itself.
+
+        Raises:
+            NonFiniteError: If an environment hands out, or training arrives at, NaN or infinity;
+                see :class:`~sb3_flowpolicy.guard.TrainingGuard`.
         """
         callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
         first = self._models[0]
@@ -150,11 +157,13 @@ class SeedBatch:
             # Who goes on after saving must not see the same episodes again.
             seeds = [seed + first.num_timesteps for seed in self.seeds]
             self._obs, _ = self._venv.reset(seed=seeds)  # type: ignore[arg-type]
+            check_experience({"observations": self._obs}, first.num_timesteps, self._who)
             self._episodes.restart()
         to_go = first._total_timesteps - first.num_timesteps
         bar = make_progress_bar(to_go) if progress_bar else None
         try:
             self._run(callbacks, log_interval, bar)
+            self._guard.look()
         finally:
             # Whatever happened, the agents are ordinary models again.
             if bar is not None:
@@ -272,6 +281,7 @@ class SeedBatch:
         if self._engine is None:
             self._engine = Engine(models, first.critic_loss_coef, compiled, first.autocast)
         self._engine.synchronize()
+        self._guard.restart()
         buffers = self._buffers()
         # An agent that was trained on its own has its buffer's arrays to itself since then.
         if not self._storage.rows.holds(buffers):
@@ -294,6 +304,9 @@ class SeedBatch:
             next_obs = obs.copy()
             for seed in np.flatnonzero(dones).tolist():
                 next_obs[seed] = infos["final_obs"][seed]
+            check_experience({"final observations": next_obs}, first.num_timesteps + 1, self._who)
+        columns = {"observations": obs, "rewards": rewards}
+        check_experience(columns, first.num_timesteps + 1, self._who)
         self._storage.add(
             observations=self._obs,
             next_observations=next_obs,
@@ -317,6 +330,9 @@ class SeedBatch:
         self._episodes.step(rewards, dones, infos, log_interval)
         return going
 
+    def _who(self, index: int) -> str:
+        return f"seed {self.seeds[index]}"
+
     def _act(self, obs: np.ndarray) -> np.ndarray:
         """Return scaled actions, (S, *shape)."""
         first = self._models[0]
@@ -336,11 +352,14 @@ class SeedBatch:
         if rate != first.actor.optimizer.param_groups[0]["lr"]:
             for model in self._models:
                 update_learning_rate(model.actor.optimizer, rate)
+        self._guard.before_updates()
         rows = self._noise["rows"].draw_many(first.gradient_steps)
         noise = self._noise["updates"].draw_many(first.gradient_steps).transpose(1, 2)
-        self._losses = self._engine.train(self._storage.gather(rows, first.gamma, noise))
+        batches = self._storage.gather(rows, first.gamma, noise)
+        self._losses = self._engine.train(batches).tolist()
         for model in self._models:
             model._n_updates += first.gradient_steps
+        self._guard.after_updates(LOSSES, self._losses, self._engine.history, batches)
 
     def _before_dump(self, seed: int) -> None:
         """Record what SB3 records at each update only now that somebody reads it."""

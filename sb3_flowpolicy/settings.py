@@ -50,6 +50,17 @@ def flag(name: str, value: Any) -> bool:
     return value
 
 
+def one_of(*words: str) -> Check:
+    """Accept any of these words."""
+
+    def check(name: str, value: Any) -> str:
+        if not isinstance(value, str) or value not in words:
+            raise ValueError(f"{name} must be one of {words}, got {value!r}")
+        return value
+
+    return check
+
+
 def optional(check: Check) -> Check:
     """Accept None, too."""
     return lambda name, value: None if value is None else check(name, value)

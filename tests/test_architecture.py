@@ -12,9 +12,11 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # From the ground up. A package may import those before it, and nothing after.
 FLOORS = [
+    "finite",
     "distributions",
     "density",
     "policies",
+    "guard",
     "engine",
     "settings",
     "bundle",

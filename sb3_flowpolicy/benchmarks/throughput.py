@@ -24,6 +24,7 @@ GROUPS = {
     "updates": "updates",
     "learn": "learning",
     "environments": "environments",
+    "trust": "trust",
     "flow": "flows",
 }
 ROUNDS, TURN_SECONDS = 7, 0.5
@@ -37,6 +38,8 @@ Measure how fast sb3_flowpolicy is next to its peers, on this machine, now.
                 SB3's SAC (and SBX where installed), and against the matrix products alone
   learn         environment steps per second of learn() on TunnelDiagonal-v0
   environments  steps per second of the environments, single and in batches of 64
+  trust         steps per second of learn() with and without the training guard; calls of predict
+                per second in each deterministic_mode, 64 candidates
   flow          RealNVP forward and backward against zuko's
 
 Entrants take turns (A B C, A B C, ...), so that whatever else the machine does slows all of

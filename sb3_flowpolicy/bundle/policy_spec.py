@@ -15,7 +15,8 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_flowpolicy import policies
 from sb3_flowpolicy.policies import DistributionPolicy
-from sb3_flowpolicy.settings import Check, flag, integer, number, optional
+from sb3_flowpolicy.policies.deterministic import MODES as DETERMINISTIC_MODES
+from sb3_flowpolicy.settings import Check, flag, integer, number, one_of, optional
 
 
 def _by_name(*classes: type) -> dict[str, Any]:
@@ -59,6 +60,9 @@ _PLAIN: dict[str, Check] = {
     "normalize_images": flag,
     "n_critics": integer(1),
     "share_features_extractor": flag,
+    "deterministic_mode": one_of(*DETERMINISTIC_MODES),
+    # More would take gigabytes at the first prediction.
+    "deterministic_samples": integer(2, 2**16),
 }
 _ARGUMENTS = ("features_extractor_kwargs", "optimizer_kwargs", "distribution_kwargs")
 

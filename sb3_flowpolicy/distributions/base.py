@@ -9,6 +9,9 @@ import torch as th
 from torch import nn
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+# Points up to this many standard deviations away have log-densities and gradients that fit into
+# float32.
+FARTHEST = 1e12
 
 
 class ActionDistribution(nn.Module, ABC):
@@ -107,6 +110,11 @@ class ActionDistribution(nn.Module, ABC):
 def standard_normal_log_prob(noise: th.Tensor) -> th.Tensor:
     """Log-density of a standard normal, summed over the last dimension: (..., M) -> (...)."""
     return -(0.5 * noise.square() + LOG_SQRT_2PI).sum(-1)
+
+
+def score_standard_normal(point: th.Tensor) -> th.Tensor:
+    """Log-density at a given point: farther out than ``FARTHEST`` as low as there, not infinite."""
+    return standard_normal_log_prob(point.clamp(-FARTHEST, FARTHEST))
 
 
 def soft_bound(value: th.Tensor, bound: float) -> th.Tensor:

@@ -5,7 +5,12 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_flowpolicy.distributions.base import soft_bound, standard_normal_log_prob
+from sb3_flowpolicy.distributions.base import (
+    FARTHEST,
+    score_standard_normal,
+    soft_bound,
+    standard_normal_log_prob,
+)
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
 # Two coordinates can correlate up to 10 / sqrt(1 + 10^2) = 0.995.
@@ -80,8 +85,9 @@ class FullCovarianceGaussian(DiagGaussian):
         loc, log_std = self.loc_and_log_std(context)
         lower, log_norm = self.unit_lower(context)
         log_diag = log_std - log_norm
-        scaled = (value - loc) * (-log_diag).exp()
+        scaled = ((value - loc) * (-log_diag).exp()).clamp(-FARTHEST, FARTHEST)
+        # Solving may multiply by up to 11 per dimension, which float64 survives in 250 of them.
         noise = th.linalg.solve_triangular(
-            lower, scaled.unsqueeze(-1), upper=False, unitriangular=True
+            lower.double(), scaled.double().unsqueeze(-1), upper=False, unitriangular=True
         ).squeeze(-1)
-        return standard_normal_log_prob(noise) - log_diag.sum(-1)
+        return score_standard_normal(noise).to(scaled) - log_diag.sum(-1)

@@ -7,6 +7,7 @@ from torch import nn
 
 from sb3_flowpolicy.distributions.base import (
     ActionDistribution,
+    score_standard_normal,
     standard_normal_log_prob,
 )
 
@@ -56,7 +57,7 @@ class DiagGaussian(ActionDistribution):
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
         loc, log_std = self.loc_and_log_std(context)
-        return standard_normal_log_prob((value - loc) * (-log_std).exp()) - log_std.sum(-1)
+        return score_standard_normal((value - loc) * (-log_std).exp()) - log_std.sum(-1)
 
     def _mode(self, context: th.Tensor) -> th.Tensor:
         return self.mu(context)

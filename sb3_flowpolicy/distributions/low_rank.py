@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_flowpolicy.distributions.base import LOG_SQRT_2PI, positive_int, soft_bound
+from sb3_flowpolicy.distributions.base import FARTHEST, LOG_SQRT_2PI, positive_int, soft_bound
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
 # Three units of u reach tanh(3) = 0.995: a single column of V spans the whole action box.
@@ -78,7 +78,7 @@ class LowRankGaussian(DiagGaussian):
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
         loc, log_std, columns = self.covariance_factors(context)
-        scaled = (value - loc) * (-log_std).exp()
+        scaled = ((value - loc) * (-log_std).exp()).clamp(-FARTHEST, FARTHEST)
         hidden = th.cat([scaled, scaled.new_zeros(*scaled.shape[:-1], self.rank)], dim=-1)
         return self._density(log_std, columns, hidden)
 

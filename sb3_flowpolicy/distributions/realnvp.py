@@ -12,6 +12,7 @@ from torch import nn
 from sb3_flowpolicy.distributions.base import (
     ActionDistribution,
     positive_int,
+    score_standard_normal,
     standard_normal_log_prob,
 )
 from sb3_flowpolicy.distributions.coupling import CouplingPair
@@ -121,7 +122,7 @@ class RealNVP(ActionDistribution):
         for pair, share in zip(reversed(self.pairs), reversed(shares), strict=True):
             value, ladj = pair.inverse(value, share)
             total = total + ladj
-        return standard_normal_log_prob(value) - total
+        return score_standard_normal(value) - total
 
     def _mode(self, context: th.Tensor) -> th.Tensor:
         zeros = context.new_zeros(*context.shape[:-1], self.action_dim)

@@ -142,6 +142,8 @@ class Engine:
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
             return networks.sample(actor, obs, noise)[0]
 
+        #: Losses of each update of the last :meth:`train`, (4, S): to find out which went wrong.
+        self.history: list[th.Tensor] = []
         self._rows: ReplayRows | None = None
         self._state: TrainState | None = None
         self._fixed: list[tuple[th.Tensor, int]] = []
@@ -284,7 +286,7 @@ class Engine:
             self._learning_rates = rates, th.tensor(rates, dtype=th.float64, device=device)
         learning_rates = self._learning_rates[1]
         state = self.state()
-        history = []
+        history = self.history = []
         n_parameters = state.actor.numel() + state.critic.numel()
         with threads_for(n_parameters * batches[0].rewards.shape[1]):
             for k, batch in enumerate(batches, start):

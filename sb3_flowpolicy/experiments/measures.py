@@ -92,9 +92,9 @@ class DeterministicEpisodes:
         self.venv: VectorEnv = make_vec_env(env, n_models * n_episodes)
 
     def run(
-        self, models: list[SACFlow], seeds: tuple[int, ...]
+        self, models: list[SACFlow], seeds: tuple[int, ...], deterministic: bool = True
     ) -> list[tuple[float, float | None]]:
-        """Return mean return and success rate of each policy.
+        """Return mean return and success rate of each policy, exploring if not ``deterministic``.
 
         Episodes start from the same seeds at every call, far from those of training. The success
         rate is None where the environment does not tell.
@@ -105,7 +105,9 @@ class DeterministicEpisodes:
         returns, running = np.zeros(count), np.ones(count, dtype=bool)
         success: np.ndarray | None = None
         while running.any():
-            obs, rewards, terminated, truncated, infos = self.venv.step(self._act(models, obs))
+            obs, rewards, terminated, truncated, infos = self.venv.step(
+                self._act(models, obs, deterministic)
+            )
             returns += rewards * running
             ended = (terminated | truncated) & running
             told = infos.get("final_info", {}).get("is_success")
@@ -119,11 +121,11 @@ class DeterministicEpisodes:
             return [(mean, None) for mean in means]
         return list(zip(means, success.reshape(shape).mean(1).tolist(), strict=True))
 
-    def _act(self, models: list[SACFlow], obs: np.ndarray) -> np.ndarray:
+    def _act(self, models: list[SACFlow], obs: np.ndarray, deterministic: bool) -> np.ndarray:
         parts = np.split(obs, self.n_models)
         return np.concatenate(
             [
-                model.predict(part, deterministic=True)[0]
+                model.predict(part, deterministic=deterministic)[0]
                 for model, part in zip(models, parts, strict=True)
             ]
         )

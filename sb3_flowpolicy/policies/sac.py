@@ -19,7 +19,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_flowpolicy.distributions.base import positive_int
+from sb3_flowpolicy.finite import all_finite, check_observation
 from sb3_flowpolicy.policies.actor import FlowActor
+from sb3_flowpolicy.policies.deterministic import (
+    DETERMINISTIC_DEFAULTS,
+    best_actions,
+    check_settings,
+)
 
 _SAC_POLICY_KWARGS = set(inspect.signature(SACPolicy.__init__).parameters)
 
@@ -33,13 +39,17 @@ class DistributionPolicy(SACPolicy):
         lr_schedule: Learning rate schedule.
         distribution: Name of a registered density. Default: the policy class's own.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
+        deterministic_mode: What ``predict(..., deterministic=True)`` does: ``"base"`` takes the
+            image of the base mean, ``"log_prob"`` the most likely of several candidates, ``"q"``
+            the best by the critics. May be set afterwards as well.
+        deterministic_samples: Number of candidates, at least 2; the base mean is one of them.
         **sac_policy_kwargs: Everything that SB3's ``SACPolicy`` takes: ``net_arch``,
             ``activation_fn``, ``features_extractor_class``, ``optimizer_kwargs``, ``n_critics``,
             ``share_features_extractor``, ...
 
     Raises:
-        ValueError: If the action space is no bounded Box, the density or one of its arguments
-            is unknown, or ``use_sde=True`` is asked of anything but the diagonal normal
+        ValueError: If the action space is no bounded Box, the density, one of its arguments or
+            the mode is unknown, or ``use_sde=True`` is asked of anything but the diagonal normal
             distribution (whose actor is then SB3's own). Plain ``SAC`` refuses such an action
             space itself, with an ``AssertionError``, before it builds the policy.
     """
@@ -55,6 +65,8 @@ class DistributionPolicy(SACPolicy):
         *,
         distribution: str | None = None,
         distribution_kwargs: Mapping[str, Any] | None = None,
+        deterministic_mode: str = DETERMINISTIC_DEFAULTS["deterministic_mode"],
+        deterministic_samples: int = DETERMINISTIC_DEFAULTS["deterministic_samples"],
         **sac_policy_kwargs: Any,
     ) -> None:
         bounded = (
@@ -87,6 +99,9 @@ class DistributionPolicy(SACPolicy):
                 "use_sde must be False unless distribution is 'gaussian': gSDE is a linear noise "
                 f"of its own, got use_sde=True with {self.distribution!r}"
             )
+        self._uses_sde = bool(sac_policy_kwargs.get("use_sde"))
+        self.deterministic_samples = deterministic_samples
+        self.deterministic_mode = deterministic_mode
         sac_policy_kwargs.setdefault(
             "features_extractor_class", self.default_features_extractor_class
         )
@@ -104,8 +119,25 @@ class DistributionPolicy(SACPolicy):
         )
         return actor.to(self.device)
 
+    @property
+    def deterministic_mode(self) -> str:
+        """How a deterministic action is chosen: ``"base"``, ``"log_prob"`` or ``"q"``."""
+        return self._deterministic_mode
+
+    @deterministic_mode.setter
+    def deterministic_mode(self, mode: str) -> None:
+        check_settings(mode, self.deterministic_samples, self._uses_sde)
+        self._deterministic_mode = mode
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        actions = super()._predict(observation, deterministic)
+        parts = observation if isinstance(observation, dict) else {"": observation}
+        check_observation({key: part.detach().cpu().numpy() for key, part in parts.items()})
+        if deterministic and self.deterministic_mode != "base":
+            assert isinstance(self.actor, FlowActor)  # anything else allows "base" only
+            mode, n_candidates = self.deterministic_mode, self.deterministic_samples
+            actions = best_actions(self.actor, self.critic, observation, mode, n_candidates)
+        else:
+            actions = super()._predict(observation, deterministic)
         check_finite_actions(actions.detach().cpu().numpy())
         return actions
 
@@ -115,11 +147,16 @@ class DistributionPolicy(SACPolicy):
         if not self.training == self.actor.training == self.critic.training == mode:
             super().set_training_mode(mode)
 
+    def deterministic_settings(self) -> dict[str, Any]:
+        """Return the settings that may be set after construction, by name."""
+        return {name: getattr(self, name) for name in DETERMINISTIC_DEFAULTS}
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(
             distribution=self.distribution,
             distribution_kwargs=self.distribution_kwargs,
+            **self.deterministic_settings(),
             # Missing in SB3's: a policy that shares its extractor would load as one that does not.
             share_features_extractor=self.share_features_extractor,
         )
@@ -145,7 +182,7 @@ def _check_net_arch(net_arch: Any) -> None:
 
 def check_finite_actions(actions: np.ndarray) -> None:
     """Raise ``ValueError`` rather than send NaN to an environment, as stock SAC does."""
-    if np.isnan(actions).any():
+    if not all_finite(actions):
         raise ValueError(
             "observation and weights must be finite for an action to be, got actions with NaN"
         )

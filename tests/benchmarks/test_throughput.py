@@ -10,21 +10,21 @@ import pytest
 import torch as th
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_flowpolicy.benchmarks import environments, flows, learning, updates
+from sb3_flowpolicy.benchmarks import environments, flows, learning, trust, updates
 from sb3_flowpolicy.benchmarks.limit import products_alone
 from sb3_flowpolicy.benchmarks.report import Row
 from sb3_flowpolicy.benchmarks.throughput import GROUPS, main
 from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
 from sb3_flowpolicy.sac_flow import SACFlow
 
-MODULES = (updates, learning, environments, flows)
+MODULES = (updates, learning, environments, trust, flows)
 
 
 def test_quick_run_writes_the_documented_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "quick.json"
-    groups = ["learn", "environments", "flow"]
+    groups = ["learn", "environments", "trust", "flow"]
     only = [word for group in groups for word in ("--only", group)]
     main(["--quick", "--json", str(path), *only])
     result = json.loads(path.read_text())

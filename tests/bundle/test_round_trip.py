@@ -277,3 +277,14 @@ def test_errors_are_values_and_name_the_file(tmp_path: Path) -> None:
     ):
         SACFlow.load_safe(tmp_path / "nowhere")
     assert issubclass(BundleError, ValueError)
+
+
+def test_a_deterministic_mode_that_was_set_later_on_is_kept(bundle: Path, tmp_path: Path) -> None:
+    model = SACFlow.load_safe(bundle)
+    model.policy.deterministic_samples = 8
+    model.policy.deterministic_mode = "q"
+    loaded = SACFlow.load_safe(model.save_safe(tmp_path / "model"))
+    assert loaded.policy.deterministic_settings() == {
+        "deterministic_mode": "q",
+        "deterministic_samples": 8,
+    }

@@ -148,6 +148,19 @@ def test_saturated_actions_stay_finite(density: ActionDistribution, scale: float
         assert parameter.grad.isfinite().all(), name
 
 
+@pytest.mark.parametrize("scale", [1e3, 1e8])
+def test_scores_of_unlikely_actions_stay_finite(density: ActionDistribution, scale: float) -> None:
+    squashed = TanhSquashed(density).float()
+    generator = th.Generator().manual_seed(7)
+    context = (th.randn(64, CONTEXT_DIM, generator=generator) * scale).requires_grad_()
+    corners = th.randint(0, 2, (64, density.action_dim), generator=generator) * 2.0 - 1.0
+    log_prob = squashed.log_prob(context, corners)
+    assert log_prob.isfinite().all()
+    log_prob.mean().backward()
+    assert context.grad is not None
+    assert context.grad.isfinite().all()
+
+
 def test_same_numbers_stacked_over_seeds(density: ActionDistribution) -> None:
     """What SeedBatch relies on: parameters, context and noise may carry a leading axis."""
     name = next(n for n, c in registered_distributions().items() if c is type(density))

@@ -1,0 +1,254 @@
+"""``python -m sb3_flowpolicy.benchmarks.stress``: hostile data, every density, nothing but numbers.
+
+Each case fills a replay buffer with transitions that no environment should hand out, and trains on
+them. The tests run the same cases, briefly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.logger import configure
+
+from sb3_flowpolicy.distributions import registered_distributions
+from sb3_flowpolicy.finite import NonFiniteError
+from sb3_flowpolicy.policies import FlowActor, FlowPolicy
+from sb3_flowpolicy.sac_flow import SACFlow
+
+N_TRANSITIONS, OBS_DIM = 1000, 5
+UPDATES, UPDATES_BETWEEN_LOOKS = 2000, 100
+
+# Arrays of one replay buffer, by name.
+Columns = dict[str, np.ndarray]
+
+
+def _ordinary(columns: Columns) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Case:
+    """A way to make training hard.
+
+    Args:
+        change: Changes ordinary transitions in place.
+        settings: Arguments of :class:`SACFlow`, beside the defaults.
+        action_dim: Number of actions D.
+    """
+
+    change: Callable[[Columns], None] = _ordinary
+    settings: dict[str, Any] = field(default_factory=dict)
+    action_dim: int = 3
+
+
+def _scale(column: str, factor: float) -> Callable[[Columns], None]:
+    def change(columns: Columns) -> None:
+        columns[column] *= factor
+        if column == "observations":
+            columns["next_observations"] *= factor
+
+    return change
+
+
+def _set(*names: str, value: float) -> Callable[[Columns], None]:
+    def change(columns: Columns) -> None:
+        for name in names:
+            columns[name][:] = value
+
+    return change
+
+
+def _saturate(columns: Columns) -> None:
+    columns["actions"][:] = np.sign(columns["actions"])
+
+
+def _everything(columns: Columns) -> None:
+    _scale("observations", 1e8)(columns)
+    _scale("rewards", 1e6)(columns)
+    _saturate(columns)
+
+
+CASES = {
+    "ordinary": Case(),
+    "rewards of 1e6": Case(_scale("rewards", 1e6)),
+    "constant observations": Case(_set("observations", "next_observations", value=1.0)),
+    "observations of zero": Case(_set("observations", "next_observations", value=0.0)),
+    "observations of 1e8": Case(_scale("observations", 1e8)),
+    "temperature 0": Case(settings={"ent_coef": 0.0}),
+    "temperature 1e-12": Case(settings={"ent_coef": 1e-12}),
+    "temperature 1e3": Case(settings={"ent_coef": 1e3}),
+    "learned temperature, entropy out of reach": Case(settings={"target_entropy": 1e3}),
+    "learned temperature, entropy of minus 1000": Case(settings={"target_entropy": -1e3}),
+    "saturated actions": Case(_saturate),
+    "all actions the same": Case(_set("actions", value=0.3)),
+    "all actions 1": Case(_set("actions", value=1.0)),
+    "batch of 1": Case(settings={"batch_size": 1}),
+    "one action": Case(action_dim=1),
+    "one action, saturated": Case(_saturate, action_dim=1),
+    "seventeen actions": Case(action_dim=17),
+    "learning rate 1e-2": Case(settings={"learning_rate": 1e-2}),
+    "all of it at once": Case(_everything, {"learning_rate": 1e-2, "batch_size": 1}),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is left of a case; every number is finite, or ``failure`` says what was not."""
+
+    distribution: str
+    case: str
+    updates: int
+    failure: str = ""
+    largest_parameter: float = float("nan")
+    largest_critic_loss: float = float("nan")
+    lowest_log_prob: float = float("nan")
+    highest_log_prob: float = float("nan")
+
+
+def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
+    """Train a small agent on the transitions of a case, looking at everything as it goes.
+
+    Args:
+        distribution: Name of a registered density.
+        name: One of ``CASES``.
+        updates: Number of updates, a multiple of 100.
+
+    Returns:
+        Extremes over all looks, one per 100 updates; ``failure`` is empty if all was finite.
+
+    Example:
+        >>> run_case("gaussian", "batch of 1", updates=100).failure
+        ''
+    """
+    model = _model(distribution, CASES[name])
+    logs, losses, largest = [], [], 0.0
+    for done in range(0, updates, UPDATES_BETWEEN_LOOKS):
+        try:
+            model.train(UPDATES_BETWEEN_LOOKS, model.batch_size)
+            model._guard.look()
+        except NonFiniteError as error:
+            return Outcome(distribution, name, done, str(error))
+        losses.append(model.logger.name_to_value["train/critic_loss"])
+        largest = max(largest, float(np.abs(model.policy.parameters_to_vector()).max()))
+        log_prob = _log_probabilities(model)
+        if not log_prob.isfinite().all():
+            return Outcome(distribution, name, done, "actions or log-probabilities not finite")
+        logs += [log_prob.min().item(), log_prob.max().item()]
+    return Outcome(distribution, name, updates, "", largest, max(losses), min(logs), max(logs))
+
+
+class _Spaces(gym.Env):
+    """Nothing but spaces: never stepped."""
+
+    def __init__(self, action_dim: int) -> None:
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float32)
+        self.action_space = gym.spaces.Box(-1, 1, (action_dim,), np.float32)
+
+
+def _model(distribution: str, case: Case) -> SACFlow:
+    settings = {"batch_size": 32, "learning_rate": 3e-4, **case.settings}
+    model = SACFlow(
+        FlowPolicy,
+        _Spaces(case.action_dim),
+        buffer_size=N_TRANSITIONS,
+        compile=False,
+        seed=0,
+        device="cpu",
+        policy_kwargs={"distribution": distribution, "net_arch": [32, 32]},
+        **settings,
+    )
+    model.set_logger(configure(None, []))
+    rng = np.random.default_rng(0)
+    columns = {
+        "observations": rng.normal(size=(N_TRANSITIONS, 1, OBS_DIM)),
+        "next_observations": rng.normal(size=(N_TRANSITIONS, 1, OBS_DIM)),
+        "actions": rng.uniform(-1, 1, (N_TRANSITIONS, 1, case.action_dim)),
+        "rewards": rng.normal(size=(N_TRANSITIONS, 1)),
+        "dones": (rng.random((N_TRANSITIONS, 1)) < 0.02).astype(float),
+    }
+    case.change(columns)
+    buffer = model.replay_buffer
+    assert buffer is not None
+    for key, column in columns.items():
+        getattr(buffer, key)[:] = column
+    buffer.full = True
+    return model
+
+
+@th.no_grad()
+def _log_probabilities(model: SACFlow) -> th.Tensor:
+    """Score fresh actions and stored ones, at observations of the buffer and far from them."""
+    assert isinstance(model.actor, FlowActor)
+    buffer = model.replay_buffer
+    assert buffer is not None
+    obs = th.as_tensor(buffer.observations[:64, 0])
+    obs = th.cat([obs, th.zeros_like(obs[:1]), th.full_like(obs[:1], 1e8)])
+    actions, log_prob = model.actor.action_log_prob(obs)
+    best = model.actor(obs, deterministic=True)
+    stored = th.as_tensor(buffer.actions[: len(obs), 0])
+    scores = [model.actor.log_prob(obs, which) for which in (stored, actions, best)]
+    outside = (th.cat([actions, best]).abs() <= 1).logical_not().any()
+    return th.cat([log_prob, *scores, th.full((1,), float("nan") if outside else 0.0)])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the matrix and print it; the exit status says whether all was finite.
+
+    Args:
+        arguments: Command line without the program's name. Default: that of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.benchmarks.stress",
+        description="Train every registered density on hostile transitions and say whether "
+        "losses, parameters, optimizers, actions and log-probabilities stayed finite.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--updates", type=int, default=UPDATES, help="updates per case")
+    parser.add_argument("--csv", type=Path, help="also write the table to this file")
+    args = parser.parse_args(arguments)
+    if args.updates < 1 or args.updates % UPDATES_BETWEEN_LOOKS:
+        parser.error(f"--updates must be a multiple of {UPDATES_BETWEEN_LOOKS}")
+    th.set_num_threads(1)
+    outcomes = []
+    for distribution in registered_distributions():
+        for name in CASES:
+            outcome = run_case(distribution, name, args.updates)
+            outcomes.append(outcome)
+            print(
+                f"{distribution:16} {name:44} {outcome.failure or 'finite':10} "
+                f"|parameter| <= {outcome.largest_parameter:<8.3g} "
+                f"log-prob {outcome.lowest_log_prob:.3g} to {outcome.highest_log_prob:.3g}",
+                flush=True,
+            )
+    failed = sum(bool(outcome.failure) for outcome in outcomes)
+    print(f"{len(outcomes) - failed} of {len(outcomes)} cases finite over {args.updates} updates")
+    if args.csv is not None:
+        _write(args.csv, outcomes)
+    sys.exit(1 if failed else 0)
+
+
+def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
+    text = StringIO()
+    names = list(Outcome.__dataclass_fields__)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    for outcome in outcomes:
+        values = (getattr(outcome, name) for name in names)
+        writer.writerow([f"{v:.4g}" if isinstance(v, float) else v for v in values])
+    draft = path.with_suffix(".tmp")
+    draft.write_text(text.getvalue())
+    draft.replace(path)
+
+
+if __name__ == "__main__":
+    main()

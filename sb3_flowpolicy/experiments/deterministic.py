@@ -1,0 +1,104 @@
+"""``python -m sb3_flowpolicy.experiments.deterministic``: what is the base mean of a flow worth?"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.experiments.measures import DeterministicEpisodes, own_random_numbers
+from sb3_flowpolicy.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.policies.deterministic import MODES
+from sb3_flowpolicy.seed_batch import SeedBatch
+
+WAYS = (*MODES, "stochastic")
+COLUMNS = ("env", "ent_coef", "seed", "step", "way", "success", "return")
+
+
+def compare(
+    env: str, seeds: Sequence[int], steps: int, every: int, episodes: int, **overrides: Any
+) -> list[dict[str, object]]:
+    """Train ``sac_flow`` and test each agent in each way of acting.
+
+    Args:
+        env: Environment that tells of success.
+        seeds: Seeds of the agents.
+        steps: Steps per agent.
+        every: Steps between two tests.
+        episodes: Episodes per test.
+        **overrides: Instead of those of the hyperparameter file.
+
+    Returns:
+        One row per test, agent and way, see ``COLUMNS``.
+    """
+    settings = {**load_hyperparameters("sac_flow", env), **overrides}
+    del settings["n_timesteps"]
+    batch = SeedBatch(settings.pop("policy"), env, seeds, device="cpu", **settings)
+    tests = DeterministicEpisodes(env, len(seeds), episodes)
+    rows: list[dict[str, object]] = []
+    for step in range(every, steps + 1, every):
+        batch.learn(every, reset_num_timesteps=step == every, log_interval=None)
+        for way in WAYS:
+            for model in batch.models:
+                model.policy.deterministic_mode = way if way in MODES else "base"  # type: ignore[assignment]
+            with own_random_numbers(step, *seeds):
+                found = tests.run(batch.models, tuple(seeds), deterministic=way in MODES)
+            for seed, (mean, success) in zip(seeds, found, strict=True):
+                values = (env, settings["ent_coef"], seed, step, way, success, round(mean, 4))
+                rows.append(dict(zip(COLUMNS, values, strict=True)))
+        _print(env, step, rows[-len(WAYS) * len(seeds) :])
+    tests.close()
+    return rows
+
+
+def _print(env: str, step: int, rows: Sequence[dict[str, Any]]) -> None:
+    print(f"{env}, step {step}: success per seed", flush=True)
+    for way in WAYS:
+        rates = [row["success"] for row in rows if row["way"] == way]
+        cells = " ".join("   -" if rate is None else f"{rate:4.2f}" for rate in rates)
+        print(f"  {way:10} {cells}", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Compare the ways on the environments that the command line names.
+
+    Args:
+        arguments: Command line without the program's name. Default: that of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.experiments.deterministic",
+        description="Train sac_flow and test it in four ways: the base mean, the best of 64 "
+        "candidates by density, the best by the critics, and with exploration.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--envs", nargs="+", default=["TunnelHorizontal-v0", "TunnelDiagonal-v0"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(101, 111)))
+    parser.add_argument("--steps", type=int, default=60_000, help="steps per seed")
+    parser.add_argument("--every", type=int, default=10_000, help="steps between two tests")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes per test and seed")
+    parser.add_argument("--ent-coef", default="auto", help="a number, or auto: learned")
+    parser.add_argument("--csv", type=Path, help="also write the table to this file")
+    args = parser.parse_args(arguments)
+    ent_coef = args.ent_coef if args.ent_coef.startswith("auto") else float(args.ent_coef)
+    th.set_num_threads(1)
+    rows: list[dict[str, object]] = []
+    for env in args.envs:
+        rows += compare(env, args.seeds, args.steps, args.every, args.episodes, ent_coef=ent_coef)
+        if args.csv is not None:
+            text = StringIO()
+            writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+            draft = args.csv.with_suffix(".tmp")
+            draft.write_text(text.getvalue())
+            draft.replace(args.csv)
+
+
+if __name__ == "__main__":
+    main()

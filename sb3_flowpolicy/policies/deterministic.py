@@ -1,0 +1,92 @@
+"""What to do without exploring: the base mean, or the best of a fixed set of candidates."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_flowpolicy.policies.actor import FlowActor
+
+MODES = ("base", "log_prob", "q")
+DETERMINISTIC_DEFAULTS: dict[str, Any] = {"deterministic_mode": "base", "deterministic_samples": 64}
+# Candidates that are held in memory at once, whatever the number of observations.
+_MOST_AT_ONCE = 2**16
+
+
+def check_settings(mode: str, n_candidates: int, use_sde: bool) -> None:
+    """Raise ``ValueError`` if this is no way to choose an action."""
+    if mode not in MODES:
+        raise ValueError(f"deterministic_mode must be one of {MODES}, got {mode!r}")
+    if mode != "base" and use_sde:
+        raise ValueError(f'deterministic_mode must be "base" with use_sde=True, got {mode!r}')
+    is_count = isinstance(n_candidates, int) and not isinstance(n_candidates, bool)
+    if not is_count or n_candidates < 2:
+        raise ValueError(f"deterministic_samples must be an integer >= 2, got {n_candidates!r}")
+
+
+def best_actions(
+    actor: FlowActor, critic: ContinuousCritic, obs: PyTorchObs, mode: str, n_candidates: int
+) -> th.Tensor:
+    """Choose the best of several candidates for each observation.
+
+    The candidates are the images of :func:`candidate_noise`, the base mean first among them; of
+    equally good ones the first is taken. No random numbers are drawn: the same observation has
+    the same action, today and after loading.
+
+    Args:
+        actor: Actor with a density.
+        critic: Critics of the same policy.
+        obs: Batch of observations.
+        mode: ``"log_prob"`` takes the most likely candidate, by the density of the squashed
+            action (``actor.log_prob``); ``"q"`` the one with the largest value, by the smallest
+            of the critics as in SAC's loss.
+        n_candidates: Number of candidates N, at least 2.
+
+    Returns:
+        Actions in [-1, 1], (batch, D).
+
+    References:
+        Thesis section 2.2.3, on the base mean as a flow's deterministic action.
+    """
+    context = actor.context(obs)
+    by_value = mode == "q"
+    features = critic.extract_features(obs, critic.features_extractor) if by_value else context
+    noise = candidate_noise(n_candidates, actor.density.noise_dim).to(context)
+    rows = max(1, _MOST_AT_ONCE // n_candidates)
+    chosen = []
+    for h, seen in zip(context.split(rows), features.split(rows), strict=True):
+        shape = (n_candidates, len(h), actor.density.noise_dim)
+        actions, score = actor.density.rsample_and_log_prob(h, noise.unsqueeze(1).expand(shape))
+        if by_value:
+            pairs = th.cat([seen.expand(n_candidates, *seen.shape), actions], dim=-1)
+            score = th.stack([q(pairs) for q in critic.q_networks]).amin(0).squeeze(-1)
+        chosen.append(actions[score.argmax(0), th.arange(len(h), device=h.device)])
+    return th.cat(chosen)
+
+
+@lru_cache(maxsize=8)
+def candidate_noise(n_candidates: int, noise_dim: int) -> th.Tensor:
+    """Return zero, the base mean, and points spread like standard normals.
+
+    They are Sobol points: 64 of them cover the density more evenly than random ones would.
+
+    Args:
+        n_candidates: Number of points N, at least 2.
+        noise_dim: Dimension M of the noise.
+
+    Returns:
+        The points, (N, M), the same at every call.
+
+    Example:
+        >>> candidate_noise(64, 2).mean(0).abs().max() < 0.1
+        tensor(True)
+    """
+    sobol = th.quasirandom.SobolEngine(noise_dim, scramble=True, seed=0)
+    uniform = sobol.draw(n_candidates - 1, dtype=th.float64)
+    # The ends of the interval are no points of a normal distribution.
+    points = th.special.ndtri(uniform.clamp(1e-9, 1 - 1e-9))
+    return th.cat([th.zeros(1, noise_dim, dtype=th.float64), points]).float()
