@@ -57,7 +57,8 @@ def export_onnx(
         The file's path.
 
     Raises:
-        ValueError: If the policy is not one of ours, or explores with gSDE.
+        ValueError: If the policy is not one of ours, explores with gSDE, or has another
+            ``deterministic_mode`` than ``"base"``.
         ModuleNotFoundError: If the extra ``[export]`` is not installed.
         RuntimeError: If the file's actions are not the model's.
 
@@ -78,6 +79,11 @@ def export_onnx(
         raise ValueError(
             "model must have a policy of sb3_flowpolicy with use_sde=False, got "
             f"{type(policy).__name__} with an actor of type {type(policy.actor).__name__}"
+        )
+    if policy.deterministic_mode != "base":
+        raise ValueError(
+            'deterministic_mode must be "base" for an ONNX file, which holds no candidates to '
+            f"choose from, got {policy.deterministic_mode!r}"
         )
     normalization = normalization_of(model, vec_normalize)
     deployed = DeployedPolicy(policy, normalization, stochastic).cpu().eval()

@@ -160,6 +160,9 @@ def test_the_model_is_left_as_it_was(tmp_path: Path) -> None:
 
 
 def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    choosy = SACFlow("FlowPolicy", "Pendulum-v1", policy_kwargs={"deterministic_mode": "q"})
+    with pytest.raises(ValueError, match='deterministic_mode must be "base" for an ONNX file'):
+        export_onnx(choosy, tmp_path / "choosy")
     with pytest.raises(ValueError, match="use_sde=False, got SACPolicy"):
         export_onnx(SAC("MlpPolicy", "Pendulum-v1", **FAST), tmp_path / "x")
     sde = SACFlow("GaussPolicy", "Pendulum-v1", use_sde=True, **FAST)
