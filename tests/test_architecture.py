@@ -18,6 +18,7 @@ FLOORS = [
     "engine",
     "demonstrations",
     "vec_env",
+    "checkpoint",
     "sac_flow",
     "seed_episodes",
     "seed_setup",

@@ -1,0 +1,16 @@
+"""Runs that go on exactly where they stopped: checkpoints that hold everything."""
+
+from sb3_flowpolicy.checkpoint.callback import RunCheckpointCallback
+from sb3_flowpolicy.checkpoint.resumable import Resumable
+from sb3_flowpolicy.checkpoint.session import Checkpoints, Resumption, open_checkpoint, take_up
+from sb3_flowpolicy.checkpoint.store import has_checkpoint
+
+__all__ = [
+    "Checkpoints",
+    "Resumable",
+    "Resumption",
+    "RunCheckpointCallback",
+    "has_checkpoint",
+    "open_checkpoint",
+    "take_up",
+]

@@ -1,0 +1,41 @@
+"""Checkpoints by callback: from a hyperparameter file, say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_flowpolicy.checkpoint.resumable import Resumable
+from sb3_flowpolicy.checkpoint.session import check_every
+
+
+class RunCheckpointCallback(BaseCallback):
+    """What ``SACFlow.learn(checkpoint_every=..., checkpoint_path=...)`` does, as a callback.
+
+    SB3's ``CheckpointCallback`` saves models to act with; this one saves runs to go on with.
+
+    Args:
+        checkpoint_every: Environment steps between two checkpoints, at least 1.
+        checkpoint_path: Folder for the checkpoints.
+
+    Raises:
+        ValueError: If ``checkpoint_every`` is below 1; when learning starts, if the model is not
+            resumable or the folder holds checkpoints of another run.
+    """
+
+    def __init__(self, checkpoint_every: int, checkpoint_path: str | Path) -> None:
+        super().__init__()
+        self.checkpoint_every = check_every(checkpoint_every)
+        self.checkpoint_path = checkpoint_path
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, Resumable):
+            raise ValueError(
+                "RunCheckpointCallback needs a model that can be resumed, such as SACFlow, got "
+                f"{type(self.model).__name__}"
+            )
+        self.model._start_checkpoints(self.checkpoint_path, self.checkpoint_every)
+
+    def _on_step(self) -> bool:
+        return True

@@ -1,0 +1,174 @@
+"""An off-policy algorithm whose runs can be taken up again exactly where they stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
+from sb3_flowpolicy.checkpoint.session import (
+    Checkpoints,
+    Resumption,
+    load_agent,
+    open_checkpoint,
+    take_up,
+)
+from sb3_flowpolicy.checkpoint.state import Run
+from sb3_flowpolicy.engine.replay import COLUMNS, is_plain
+
+SelfResumable = TypeVar("SelfResumable", bound="Resumable")
+
+
+class Resumable(OffPolicyAlgorithm):
+    """Mixin for SB3's off-policy algorithms, to be named before them.
+
+    Checkpoints are taken, and taken up, between rollouts: all of a run's state is then in objects,
+    none in local variables.
+    """
+
+    _checkpoints: Checkpoints | None = None
+    _resumption: Resumption | None = None
+
+    @classmethod
+    def resume(
+        cls: type[SelfResumable],
+        path: str | Path,
+        env: GymEnv | str,
+        device: th.device | str = "auto",
+    ) -> SelfResumable:
+        """Take a run up where its newest undamaged checkpoint stands.
+
+        Make the interrupted call of :meth:`learn` again, with the same arguments: it goes on to the
+        same end, and all numbers are those of a run that was not interrupted. Checkpoints contain
+        pickles: do not resume those of strangers.
+
+        Args:
+            path: Folder of checkpoints.
+            env: A new environment, built and wrapped as the run's own, or its id. It takes over the
+                state of that one, the running episode included, and its ``Monitor`` file.
+            device: Where to put the networks.
+
+        Returns:
+            The model.
+
+        Raises:
+            ValueError: If the folder holds no undamaged checkpoint, or one of another algorithm, or
+                the environment does not fit.
+        """
+        store, checkpoint = open_checkpoint(path, cls.__name__)
+        venv = cls._wrap_env(maybe_make_env(env, 0))
+        model = load_agent(cls, checkpoint, "model", venv, device)
+        run = model._run()
+        model._resumption = take_up(run, store, checkpoint)
+        if run.opaque & set(run.environments):
+            model._last_obs = None
+            if model.seed is not None:
+                # Otherwise it would live through its first episodes once more.
+                venv.seed(model.seed + model.num_timesteps)
+        return model
+
+    def _run(self) -> Run:
+        """Describe what a checkpoint of this model consists of."""
+        return Run(
+            kind=type(self).__name__,
+            agents={"model": self},
+            environments={"model": self.env},
+            ring=self._ring,
+            extra=self._extra_state,
+            set_extra=self._set_extra_state,
+        )
+
+    def _ring(self) -> tuple[RingOwner, Ring] | None:
+        buffer = self.replay_buffer
+        if buffer is None or not is_plain(buffer):
+            return None
+        columns = {name: getattr(buffer, name) for name in COLUMNS}
+        return buffer, Ring(columns, buffer.pos, buffer.full)
+
+    def _extra_state(self) -> dict[str, Any]:
+        """Return what a subclass has to note besides, between two rollouts."""
+        return {}
+
+    def _set_extra_state(self, state: dict[str, Any]) -> None:
+        """Put back what :meth:`_extra_state` returned."""
+
+    def _start_checkpoints(self, path: str | Path, checkpoint_every: int) -> None:
+        """Write checkpoints until the present call of :meth:`learn` ends."""
+        checkpoints = self._checkpoints
+        if checkpoints is None or checkpoints.path.resolve() != Path(path).resolve():
+            run = self._run()
+            checkpoints = Checkpoints(run, path, self._resumption)
+            self._checkpoints = checkpoints
+        checkpoints.start(checkpoint_every)
+
+    @contextmanager
+    def _with_checkpoints(self) -> Iterator[None]:
+        """Finish whatever :meth:`_start_checkpoints` began in between."""
+        try:
+            yield
+            if self._checkpoints is not None and self._checkpoints.active:
+                self._checkpoints.finish()
+        finally:
+            if self._checkpoints is not None:
+                self._checkpoints.stop()
+        if self._checkpoints is not None:
+            self._checkpoints.signals.deliver()
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self._resumption is not None:
+            total_timesteps = self._resumption.remaining(total_timesteps, reset_num_timesteps)
+            reset_num_timesteps = False
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any
+    ) -> RolloutReturn:
+        """Collect experience as SB3 does, after a look at whether a checkpoint is due."""
+        callbacks = {"model": callback}
+        if self._resumption is not None:
+            self._resumption.restore(callbacks)
+            self._resumption = None
+        checkpoints = self._checkpoints
+        if checkpoints is None or not checkpoints.active:
+            return super().collect_rollouts(env, callback, *args, **kwargs)
+        if not checkpoints.between_rollouts(callbacks):
+            checkpoints.cut_short()
+            return RolloutReturn(0, 0, continue_training=False)
+        rollout = super().collect_rollouts(env, callback, *args, **kwargs)
+        if not rollout.continue_training:
+            checkpoints.cut_short()
+        return rollout
+
+    def get_parameters(self) -> dict[str, dict]:
+        """Return the parameters as SB3 does, but copies that share no memory with others."""
+        return _copies(super().get_parameters())
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_checkpoints", "_resumption"]
+
+
+def _copies(value: Any) -> Any:
+    """Copy tensors, where views would bring the whole memory that they look at into a file."""
+    if isinstance(value, th.Tensor):
+        return value.detach().clone()
+    if isinstance(value, dict):
+        return type(value)((key, _copies(part)) for key, part in value.items())
+    return [_copies(part) for part in value] if isinstance(value, list) else value
