@@ -6,19 +6,19 @@ import math
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.checkpoint import Resumable, RunCheckpointCallback
+from sb3_flowpolicy.checkpoint import Resumable
 from sb3_flowpolicy.demonstrations import (
     fill_replay_buffer,
     follow_recipe,
@@ -33,8 +33,6 @@ SB3_CRITIC_LOSS_COEF = 0.5
 # Compiling takes 10 to 30 seconds and saves one to five milliseconds per update.
 UPDATES_WORTH_COMPILING = 10_000
 MOST_DRAWN_AT_ONCE = 1000
-
-SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
 
 
 class SACFlow(Resumable, SAC):
@@ -301,57 +299,6 @@ class SACFlow(Resumable, SAC):
         assert isinstance(self.train_freq, TrainFreq)
         return steps / self.env.num_envs * self.gradient_steps / self.train_freq.frequency
 
-    def learn(
-        self: SelfSACFlow,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "SACFlow",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-        checkpoint_every: int | None = None,
-        checkpoint_path: str | Path | None = None,
-    ) -> SelfSACFlow:
-        """Train as SB3's ``SAC.learn`` does.
-
-        Args:
-            total_timesteps: As in SB3, as are the following.
-            callback: Called at every step.
-            log_interval: Episodes between two dumps of the log.
-            tb_log_name: Name of the TensorBoard run.
-            reset_num_timesteps: Whether to count from zero.
-            progress_bar: Whether to show one.
-            checkpoint_every: Environment steps between two checkpoints that :meth:`resume` goes on
-                from. Ctrl-C and SIGTERM then write one, too, before they stop the program. Default:
-                none are written.
-            checkpoint_path: Folder for them, empty for a new run.
-
-        Returns:
-            Itself.
-
-        Raises:
-            ValueError: If only one of the last two is given, or the folder holds checkpoints of
-                another run.
-        """
-        if (checkpoint_every is None) != (checkpoint_path is None):
-            raise ValueError(
-                "checkpoint_every and checkpoint_path go together, got "
-                f"{checkpoint_every} and {checkpoint_path}"
-            )
-        if checkpoint_every is not None and checkpoint_path is not None:
-            checkpoints = RunCheckpointCallback(checkpoint_every, checkpoint_path)
-            callback = [*_listed(callback), checkpoints]
-        with self._with_checkpoints():
-            super().learn(
-                total_timesteps,
-                callback,
-                log_interval,
-                tb_log_name,
-                reset_num_timesteps,
-                progress_bar,
-            )
-        return self
-
     def _extra_state(self) -> dict[str, Any]:
         # Whoever acts with an engine draws other numbers than whoever acts without.
         return {"engine": self._engine is not None}
@@ -363,10 +310,3 @@ class SACFlow(Resumable, SAC):
     def _excluded_save_params(self) -> list[str]:
         engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned"]
         return [*super()._excluded_save_params(), "_demonstrations", *engine]
-
-
-def _listed(callback: MaybeCallback) -> list[BaseCallback]:
-    """Return what ``learn`` was given as a list of callbacks."""
-    if callback is None or isinstance(callback, list):
-        return callback or []
-    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]

@@ -23,6 +23,7 @@ FLOORS = [
     "seed_episodes",
     "seed_setup",
     "seed_checkpoint",
+    "seed_on_disk",
     "seed_batch",
     "hyperparameters",
     "train_seeds",

@@ -2,15 +2,6 @@
 
 from sb3_flowpolicy.checkpoint.callback import RunCheckpointCallback
 from sb3_flowpolicy.checkpoint.resumable import Resumable
-from sb3_flowpolicy.checkpoint.session import Checkpoints, Resumption, open_checkpoint, take_up
 from sb3_flowpolicy.checkpoint.store import has_checkpoint
 
-__all__ = [
-    "Checkpoints",
-    "Resumable",
-    "Resumption",
-    "RunCheckpointCallback",
-    "has_checkpoint",
-    "open_checkpoint",
-    "take_up",
-]
+__all__ = ["Resumable", "RunCheckpointCallback", "has_checkpoint"]

@@ -7,7 +7,7 @@ from pathlib import Path
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_flowpolicy.checkpoint.resumable import Resumable
-from sb3_flowpolicy.checkpoint.session import check_every
+from sb3_flowpolicy.checkpoint.session import check_every, start_checkpoints
 
 
 class RunCheckpointCallback(BaseCallback):
@@ -35,7 +35,7 @@ class RunCheckpointCallback(BaseCallback):
                 "RunCheckpointCallback needs a model that can be resumed, such as SACFlow, got "
                 f"{type(self.model).__name__}"
             )
-        self.model._start_checkpoints(self.checkpoint_path, self.checkpoint_every)
+        start_checkpoints(self.model, self.checkpoint_path, self.checkpoint_every)
 
     def _on_step(self) -> bool:
         return True

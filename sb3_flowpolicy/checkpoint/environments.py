@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TextIO
+from typing import IO, Any
 
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
@@ -67,7 +67,7 @@ def check_same_build(env: Any, names: list[str]) -> None:
         )
 
 
-def monitor_files(env: Any) -> dict[str, TextIO]:
+def monitor_files(env: Any) -> dict[str, IO[str]]:
     """Return the open files of SB3's ``Monitor`` wrappers, by layer."""
     return {
         name: layer.results_writer.file_handler

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import IO, Any
 
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
@@ -15,18 +15,18 @@ from stable_baselines3.common.logger import (
 )
 
 
-def log_files(logger: Logger) -> dict[str, TextIO]:
+def log_files(logger: Logger) -> dict[str, IO[str]]:
     """Return the files that a logger writes text to, by format."""
-    files = {}
+    files: dict[str, IO[str]] = {}
     for one in logger.output_formats:
         if isinstance(one, CSVOutputFormat | JSONOutputFormat):
             files[type(one).__name__] = one.file
-        elif isinstance(one, HumanOutputFormat) and one.own_file:
+        if isinstance(one, HumanOutputFormat) and one.own_file:
             files[type(one).__name__] = one.file
     return files
 
 
-def read_texts(files: Mapping[str, TextIO]) -> dict[str, str]:
+def read_texts(files: Mapping[str, IO[str]]) -> dict[str, str]:
     """Read open files; those that were deleted are left out.
 
     A file as a whole, not its length: whoever opens a log again empties it first.
@@ -39,7 +39,7 @@ def read_texts(files: Mapping[str, TextIO]) -> dict[str, str]:
     return texts
 
 
-def write_texts(files: Mapping[str, TextIO], texts: Mapping[str, str]) -> None:
+def write_texts(files: Mapping[str, IO[str]], texts: Mapping[str, str]) -> None:
     """Replace the contents of open files; files without a text stay as they are."""
     for name, file in files.items():
         if name in texts:

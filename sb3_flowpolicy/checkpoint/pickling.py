@@ -58,9 +58,9 @@ class _Pickler(cloudpickle.Pickler):
     def reducer_override(self, thing: Any) -> Any:
         # cloudpickle would copy what the main program defines: a resumed program, which defines it
         # again, would then have two classes that are not each other.
-        if isinstance(thing, type | FunctionType) and thing.__module__ == "__main__":
-            if getattr(sys.modules["__main__"], thing.__qualname__, None) is thing:
-                return NotImplemented
+        named = isinstance(thing, type | FunctionType) and thing.__module__ == "__main__"
+        if named and getattr(sys.modules["__main__"], thing.__qualname__, None) is thing:
+            return NotImplemented
         return super().reducer_override(thing)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,8 +16,11 @@ from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
 from sb3_flowpolicy.checkpoint.session import (
     Checkpoints,
     Resumption,
+    between_rollouts,
+    finishing,
     load_agent,
     open_checkpoint,
+    start_checkpoints,
     take_up,
 )
 from sb3_flowpolicy.checkpoint.state import Run
@@ -67,7 +68,7 @@ class Resumable(OffPolicyAlgorithm):
         store, checkpoint = open_checkpoint(path, cls.__name__)
         venv = cls._wrap_env(maybe_make_env(env, 0))
         model = load_agent(cls, checkpoint, "model", venv, device)
-        run = model._run()
+        run = model._describe_run()
         model._resumption = take_up(run, store, checkpoint)
         if run.opaque & set(run.environments):
             model._last_obs = None
@@ -76,7 +77,51 @@ class Resumable(OffPolicyAlgorithm):
                 venv.seed(model.seed + model.num_timesteps)
         return model
 
-    def _run(self) -> Run:
+    def learn(
+        self: SelfResumable,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        checkpoint_every: int | None = None,
+        checkpoint_path: str | Path | None = None,
+    ) -> SelfResumable:
+        """Train as in SB3, and write checkpoints to resume from.
+
+        Args:
+            total_timesteps: As in SB3, as are the following.
+            callback: Called at every step.
+            log_interval: Episodes between two dumps of the log.
+            tb_log_name: Name of the TensorBoard run; default: the algorithm's.
+            reset_num_timesteps: Whether to count from zero.
+            progress_bar: Whether to show one.
+            checkpoint_every: Environment steps between two checkpoints that :meth:`resume` goes on
+                from. Ctrl-C and SIGTERM then write one, too, before they stop the program. Default:
+                none are written.
+            checkpoint_path: Folder for them, empty for a new run.
+
+        Returns:
+            Itself.
+
+        Raises:
+            ValueError: If only one of the last two is given, or the folder holds checkpoints of
+                another run.
+        """
+        with finishing(self):
+            start_checkpoints(self, checkpoint_path, checkpoint_every)
+            super().learn(
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name or type(self).__name__,
+                reset_num_timesteps,
+                progress_bar,
+            )
+        return self
+
+    def _describe_run(self) -> Run:
         """Describe what a checkpoint of this model consists of."""
         return Run(
             kind=type(self).__name__,
@@ -101,28 +146,6 @@ class Resumable(OffPolicyAlgorithm):
     def _set_extra_state(self, state: dict[str, Any]) -> None:
         """Put back what :meth:`_extra_state` returned."""
 
-    def _start_checkpoints(self, path: str | Path, checkpoint_every: int) -> None:
-        """Write checkpoints until the present call of :meth:`learn` ends."""
-        checkpoints = self._checkpoints
-        if checkpoints is None or checkpoints.path.resolve() != Path(path).resolve():
-            run = self._run()
-            checkpoints = Checkpoints(run, path, self._resumption)
-            self._checkpoints = checkpoints
-        checkpoints.start(checkpoint_every)
-
-    @contextmanager
-    def _with_checkpoints(self) -> Iterator[None]:
-        """Finish whatever :meth:`_start_checkpoints` began in between."""
-        try:
-            yield
-            if self._checkpoints is not None and self._checkpoints.active:
-                self._checkpoints.finish()
-        finally:
-            if self._checkpoints is not None:
-                self._checkpoints.stop()
-        if self._checkpoints is not None:
-            self._checkpoints.signals.deliver()
-
     def _setup_learn(
         self,
         total_timesteps: int,
@@ -142,20 +165,9 @@ class Resumable(OffPolicyAlgorithm):
         self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any
     ) -> RolloutReturn:
         """Collect experience as SB3 does, after a look at whether a checkpoint is due."""
-        callbacks = {"model": callback}
-        if self._resumption is not None:
-            self._resumption.restore(callbacks)
-            self._resumption = None
-        checkpoints = self._checkpoints
-        if checkpoints is None or not checkpoints.active:
-            return super().collect_rollouts(env, callback, *args, **kwargs)
-        if not checkpoints.between_rollouts(callbacks):
-            checkpoints.cut_short()
+        if not between_rollouts(self, {"model": callback}):
             return RolloutReturn(0, 0, continue_training=False)
-        rollout = super().collect_rollouts(env, callback, *args, **kwargs)
-        if not rollout.continue_training:
-            checkpoints.cut_short()
-        return rollout
+        return super().collect_rollouts(env, callback, *args, **kwargs)
 
     def get_parameters(self) -> dict[str, dict]:
         """Return the parameters as SB3 does, but copies that share no memory with others."""

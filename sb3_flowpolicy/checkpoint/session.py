@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import stable_baselines3
 import torch as th
@@ -34,15 +35,12 @@ class Checkpoints:
         ValueError: If the folder holds another run's checkpoints.
     """
 
-    def __init__(
-        self, run: Run, path: str | Path, resumption: Resumption | None = None
-    ) -> None:
+    def __init__(self, run: Run, path: str | Path, resumption: Resumption | None = None) -> None:
         self.run = run
         self.path = Path(path)
         self.every = 1
         self.signals = StopSignals()
         self.active = False
-        self._complete = True
         self._last: int | None = None
         if resumption is not None and resumption.store.path.resolve() == self.path.resolve():
             self._store, self._rows = resumption.store, resumption.rows
@@ -75,19 +73,19 @@ class Checkpoints:
             Whether to go on: False after SIGTERM and Ctrl-C.
         """
         self.run.callbacks = dict(callbacks)
-        self._complete = True
         now, stop = self.run.first.num_timesteps, self.signals.received is not None
         if stop or self._last is None or now // self.every > self._last // self.every:
             self.write()
         return not stop
 
-    def cut_short(self) -> None:
-        """Note that a rollout was broken off: from here a run could not be resumed exactly."""
-        self._complete = False
-
     def finish(self) -> None:
-        """Write the last checkpoint of a call of ``learn``."""
-        if self._complete and self._last is not None:
+        """Write the last checkpoint of a call of ``learn`` that has reached its end.
+
+        Where a callback stopped it, that was in the middle of a rollout: going on from there could
+        not be exact.
+        """
+        first = self.run.first
+        if self._last is not None and first.num_timesteps >= first._total_timesteps:
             self.write()
 
     def stop(self) -> None:
@@ -140,16 +138,73 @@ class Resumption:
     def remaining(self, total_timesteps: int, reset_num_timesteps: bool) -> int:
         """Return how many steps the interrupted call of ``learn``, made again, has to go."""
         end = total_timesteps + (0 if reset_num_timesteps else self.begun)
-        now = self.run.first.num_timesteps
-        if end <= now:
-            # That call had ended before: the one to come is what was interrupted.
-            self.begun = end
-        return end - now
+        return end - self.run.first.num_timesteps
 
     def restore(self, callbacks: Mapping[str, BaseCallback]) -> None:
         """Put the rest of the state back: the next thing is a new step."""
         self.run.callbacks = dict(callbacks)
         state.restore_late(self.run, self.late)
+
+
+class Resumes(Protocol):
+    """Whatever learns and can be resumed: an algorithm, or a batch of them."""
+
+    _checkpoints: Checkpoints | None
+    _resumption: Resumption | None
+
+    def _describe_run(self) -> Run: ...
+
+
+def start_checkpoints(owner: Resumes, path: str | Path | None, every: int | None) -> None:
+    """Write checkpoints from now on, until :func:`finishing` ends.
+
+    Args:
+        owner: What learns.
+        path: Folder for them.
+        every: Environment steps between two of them. With both None, nothing is done.
+
+    Raises:
+        ValueError: If ``every`` is below 1 or only one of the two is given, or the folder holds
+            another run's checkpoints.
+    """
+    if path is None and every is None:
+        return
+    if path is None or every is None:
+        raise ValueError(
+            f"checkpoint_every and checkpoint_path go together, got {every} and {path}"
+        )
+    if owner._checkpoints is None or owner._checkpoints.path.resolve() != Path(path).resolve():
+        check_every(every)
+        owner._checkpoints = Checkpoints(owner._describe_run(), path, owner._resumption)
+    owner._checkpoints.start(every)
+
+
+@contextmanager
+def finishing(owner: Resumes) -> Iterator[None]:
+    """End the checkpoints that are started inside with a last one, and obey SIGTERM and Ctrl-C."""
+    try:
+        yield
+        if owner._checkpoints is not None and owner._checkpoints.active:
+            owner._checkpoints.finish()
+    finally:
+        if owner._checkpoints is not None:
+            owner._checkpoints.stop()
+        if owner._resumption is not None:
+            # This call had ended before: the next one is what was interrupted.
+            owner._resumption.begun = owner._resumption.run.first._total_timesteps
+    if owner._checkpoints is not None:
+        owner._checkpoints.signals.deliver()
+
+
+def between_rollouts(owner: Resumes, callbacks: Mapping[str, BaseCallback]) -> bool:
+    """Put back what waits for this moment, write what is due, and return whether to go on."""
+    if owner._resumption is not None:
+        owner._resumption.restore(callbacks)
+        owner._resumption = None
+    checkpoints = owner._checkpoints
+    if checkpoints is None or not checkpoints.active:
+        return True
+    return checkpoints.between_rollouts(callbacks)
 
 
 def open_checkpoint(path: str | Path, kind: str) -> tuple[CheckpointStore, Checkpoint]:

@@ -82,7 +82,9 @@ class CheckpointStore:
             self._good = [checkpoint]
             return checkpoint
         found = f"only damaged ones ({'; '.join(damages)})" if damages else "none"
-        raise ValueError(f"path must be a folder of checkpoints, got {self.path}, which has {found}")
+        raise ValueError(
+            f"path must be a folder of checkpoints, got {self.path}, which has {found}"
+        )
 
     def write(
         self,
