@@ -228,7 +228,15 @@ class SeedBatch(BatchOnDisk):
             own = copy_callback(callback, seed)
             name = f"{tb_log_name}_seed{seed}"
             # SB3 draws the first observation from the model's own environment; ours are stepped.
+            model._resumption = self._resumption
             _, ready = model._setup_learn(total_timesteps, own, reset_num_timesteps, name)
+            model._resumption = None
+            if model._checkpoints is not None and model._checkpoints.active:
+                model._checkpoints.stop()
+                raise ValueError(
+                    "a batch is checkpointed by learn(checkpoint_every=..., checkpoint_path=...), "
+                    "got a callback that does so for each agent"
+                )
             ready.on_training_start({"self": model}, {})
             callbacks += [ready] if own is not None else []
         self._take_over()

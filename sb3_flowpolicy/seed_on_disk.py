@@ -133,8 +133,6 @@ class BatchOnDisk:
         batch._adopt(models, seeds, env, monitor_dir, info_keywords)
         batch._resumption = take_up(batch._describe_run(), store, checkpoint)
         batch._storage.publish()
-        for model in models:
-            model._resumption = batch._resumption
         return batch
 
     def _describe_run(self) -> Run:
@@ -164,8 +162,6 @@ class BatchOnDisk:
         }
 
     def _set_extra_state(self, state: dict[str, Any]) -> None:
-        for model in self._models:
-            model._resumption = None
         for name, one in self._noise.items():
             one.set_state(state["noise"][name])
         self._losses = state["losses"]

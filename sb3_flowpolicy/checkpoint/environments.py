@@ -22,8 +22,8 @@ def layers(env: Any) -> dict[str, Any]:
 
     Example:
         >>> import gymnasium as gym
-        >>> list(layers(gym.make("Pendulum-v1")))[-2:]
-        ['0.0.0:OrderEnforcing', '0.0.0.0:PendulumEnv']
+        >>> list(layers(gym.make("Pendulum-v1")))[:2]
+        ['0:TimeLimit', '0.0:OrderEnforcing']
     """
     found: dict[str, Any] = {}
     waiting = [("0", env)]

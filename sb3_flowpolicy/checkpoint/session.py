@@ -184,14 +184,15 @@ def finishing(owner: Resumes) -> Iterator[None]:
     """End the checkpoints that are started inside with a last one, and obey SIGTERM and Ctrl-C."""
     try:
         yield
+        if owner._resumption is not None:
+            # This call had ended before, and its logs are to show it; the next was interrupted.
+            owner._resumption.begun = owner._resumption.run.first._total_timesteps
+            owner._resumption.restore({})
         if owner._checkpoints is not None and owner._checkpoints.active:
             owner._checkpoints.finish()
     finally:
         if owner._checkpoints is not None:
             owner._checkpoints.stop()
-        if owner._resumption is not None:
-            # This call had ended before: the next one is what was interrupted.
-            owner._resumption.begun = owner._resumption.run.first._total_timesteps
     if owner._checkpoints is not None:
         owner._checkpoints.signals.deliver()
 

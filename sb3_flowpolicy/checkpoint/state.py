@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import random
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -213,8 +214,20 @@ def _pickle_around_environments(
 
 
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
-    """Collect a callback's counters and records: whatever is made of numbers, text and arrays."""
-    return {key: value for key, value in vars(callback).items() if _is_data(value)}
+    """Collect a callback's counters and records: what is made of numbers, text and arrays.
+
+    Attributes named as arguments of its constructor are left out: settings, which may be changed.
+    """
+    settings = {name for kind in type(callback).__mro__ for name in _arguments(kind)}
+    return {
+        key: value
+        for key, value in vars(callback).items()
+        if key not in settings and _is_data(value)
+    }
+
+
+def _arguments(kind: type) -> Iterable[str]:
+    return inspect.signature(kind.__init__).parameters  # type: ignore[misc]
 
 
 def _is_data(value: Any) -> bool:

@@ -146,16 +146,19 @@ def _outcome(model: Any) -> dict[str, Any]:
 
     found = {}
     optimizers = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
-    optimizers["ent_coef"] = model.ent_coef_optimizer
+    if model.ent_coef_optimizer is not None:
+        optimizers["ent_coef"] = model.ent_coef_optimizer
     for name, value in model.policy.state_dict().items():
         found[f"parameters {name}"] = value
-    found["log_ent_coef"] = model.log_ent_coef.detach()
+    learned = model.log_ent_coef
+    found["temperature"] = model.ent_coef_tensor if learned is None else learned.detach()
     for name, optimizer in optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
             found |= {f"optimizer {name} {index} {key}": value for key, value in state.items()}
     buffer = model.replay_buffer
     for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
-        found[f"buffer {name}"] = th.from_numpy(getattr(buffer, name))
+        if hasattr(buffer, name):
+            found[f"buffer {name}"] = th.from_numpy(getattr(buffer, name))
     for name in ("num_timesteps", "_n_updates", "_episode_num"):
         found[name] = th.tensor(getattr(model, name))
     found["buffer position"] = th.tensor([buffer.pos, buffer.full])
