@@ -140,7 +140,8 @@ def restore_late(run: Run, pickled: bytes) -> None:
         mine = state["agents"][name]
         agent.start_time = time.time_ns() - mine["elapsed"]
         agent._num_timesteps_at_start = mine["begun"]
-        agent.action_noise = mine["action_noise"]
+        if agent.action_noise is not None:  # in place: the loop that has begun holds this one
+            vars(agent.action_noise).update(mine["action_noise"])
         logs.set_log_state(agent.logger, mine["log"], agent.num_timesteps)
     for name, env in run.callback_environments().items():
         if list(environments.layers(env)) == list(state["environments"].get(name, ())):
@@ -175,7 +176,7 @@ def _late(run: Run) -> dict[str, Any]:
             name: {
                 "elapsed": time.time_ns() - agent.start_time,
                 "begun": agent._num_timesteps_at_start,
-                "action_noise": agent.action_noise,
+                "action_noise": {} if agent.action_noise is None else vars(agent.action_noise),
                 "log": logs.log_state(agent.logger),
             }
             for name, agent in run.agents.items()

@@ -67,7 +67,7 @@ def main() -> int:
     return int(unequal > 0)
 
 
-def train(agent: str, engine: str, steps: int, every: int, folder: Path) -> None:
+def train(agent: str, engine: str, steps: int, every: int, folder: Path, seed: int = 1) -> None:
     """Train, or go on training, and write what has come out; ``every`` 0: no checkpoints."""
     import gymnasium as gym
     import torch as th
@@ -102,7 +102,9 @@ def train(agent: str, engine: str, steps: int, every: int, folder: Path) -> None
     if agent == "SACFlow":
         env = Monitor(gym.make("TunnelDiagonal-v0"), str(folder / "monitor"))
         model = (
-            SACFlow.resume(path, env) if again else SACFlow("FlowPolicy", env, seed=1, **settings)
+            SACFlow.resume(path, env)
+            if again
+            else SACFlow("FlowPolicy", env, seed=seed, **settings)
         )
         model.set_logger(configure(str(folder / "log_0"), ["csv"]))
         model.learn(steps, callback=Tell(), **checkpoints)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,13 +31,13 @@ from tests.checkpoint.kill_and_resume import _outcome, _rows
 ENV = "TunnelDiagonal-v0"
 FAST: dict[str, Any] = {
     "learning_starts": 20,
-    "buffer_size": 90,
+    "buffer_size": 70,
     "batch_size": 8,
     "seed": 0,
     "device": "cpu",
     "policy_kwargs": {"net_arch": [8]},
 }
-TOTAL, EVERY, BREAKS = 150, 20, (67, 128)
+TOTAL, EVERY, BREAKS = 110, 20, (47, 92)
 
 
 class BrokenError(Exception):
@@ -173,7 +174,7 @@ def test_action_noise_goes_on(tmp_path: Path) -> None:
         return {"policy": "FlowPolicy", **FAST, "action_noise": noise, "tensorboard_log": calm}
 
     calm = run_to(None, lambda: gym.make(ENV), None, noisy())
-    run_to(67, lambda: gym.make(ENV), path, noisy())
+    run_to(47, lambda: gym.make(ENV), path, noisy())
     resumed = run_to(None, lambda: gym.make(ENV), path, noisy(), resume=True)
     left, right = _state(calm), _state(resumed)
     assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
@@ -206,9 +207,7 @@ def test_callbacks_and_their_environments_go_on(tmp_path: Path) -> None:
     make_env = lambda: gym.make("Pendulum-v1", max_episode_steps=13)  # noqa: E731
     assert differences(make_env, tmp_path, evaluate) == []
     calm, *_, resumed = made
-    assert (
-        resumed.evaluations_timesteps == calm.evaluations_timesteps == [25, 50, 75, 100, 125, 150]
-    )
+    assert resumed.evaluations_timesteps == calm.evaluations_timesteps == [25, 50, 75, 100]
     assert resumed.evaluations_results == calm.evaluations_results
     assert resumed.n_calls == calm.n_calls == TOTAL
 
@@ -221,11 +220,11 @@ def test_monitor_files_are_those_of_the_undisturbed_run(tmp_path: Path) -> None:
 
     run_to(None, monitored("calm"), None, settings)
     path = tmp_path / "run" / "checkpoints"
-    run_to(67, monitored("broken"), path, settings)
+    run_to(47, monitored("broken"), path, settings)
     run_to(None, monitored("broken"), path, settings, resume=True)
     calm, broken = (_rows(tmp_path / f"{name}.monitor.csv") for name in ("calm", "broken"))
     assert calm == broken
-    assert len(calm) > 20
+    assert len(calm) > 10
     # One header, and its clock goes on.
     assert (tmp_path / "broken.monitor.csv").read_text().count("t_start") == 1
 
@@ -280,6 +279,25 @@ def test_environments_that_cannot_be_pickled_begin_a_new_episode(tmp_path: Path)
     # Neither the old episode nor the first one over again.
     assert not np.array_equal(buffer.observations[50], buffer.next_observations[49])
     assert not np.array_equal(buffer.observations[50], buffer.observations[0])
+
+
+def test_pybullet_is_not_taken_for_something_that_can_be_saved(tmp_path: Path) -> None:
+    """Its objects can be pickled, but hold handles of a simulation outside of Python."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
+        pytest.importorskip("pybullet_envs_gymnasium")
+    env_id = "InvertedPendulumBulletEnv-v0"
+    settings = {**FAST, "learning_starts": 300, "buffer_size": 300}
+    model = SACFlow("FlowPolicy", VecNormalize(make_vec_env(env_id)), **settings)
+    with pytest.warns(RuntimeWarning, match="cannot be saved .*lives outside of Python"):
+        model.learn(50, checkpoint_every=50, checkpoint_path=tmp_path)
+    with pytest.warns(RuntimeWarning, match="resuming begins new episodes"):
+        resumed = SACFlow.resume(tmp_path, VecNormalize(make_vec_env(env_id)))
+    before, after = model.get_vec_normalize_env(), resumed.get_vec_normalize_env()
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before.obs_rms.mean, after.obs_rms.mean)  # type: ignore[union-attr]
+    assert resumed.learn(80).num_timesteps == 80
 
 
 def test_without_further_checkpoints_and_by_callback(tmp_path: Path) -> None:
