@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
     from sb3_flowpolicy.policies import (
         CnnFlowPolicy,
@@ -37,15 +38,19 @@ __all__ = [
     "MultiInputFlowPolicy",
     "MultiInputGaussPolicy",
     "MultiInputLowRankPolicy",
+    "RunCheckpointCallback",
     "SACFlow",
     "SeedBatch",
+    "has_checkpoint",
     "register_distribution",
 ]
 
 _ELSEWHERE = {
     "ActionDistribution": "distributions",
+    "RunCheckpointCallback": "checkpoint",
     "SACFlow": "sac_flow",
     "SeedBatch": "seed_batch",
+    "has_checkpoint": "checkpoint",
     "register_distribution": "distributions",
 }
 

@@ -166,9 +166,8 @@ class SeedBatch(BatchOnDisk):
         reset_num_timesteps: bool,
         progress_bar: bool,
     ) -> None:
-        first, resumption = self._models[0], self._resumption
-        in_episode = resumption is not None and not resumption.run.opaque
-        if not in_episode and (self._obs is None or reset_num_timesteps):
+        first = self._models[0]
+        if not self._resumes_episodes() and (self._obs is None or reset_num_timesteps):
             # Typed as one seed, documented as one per environment.
             # Who goes on after saving must not see the same episodes again.
             seeds = [seed + first.num_timesteps for seed in self.seeds]

@@ -166,7 +166,11 @@ class BatchOnDisk:
             one.set_state(state["noise"][name])
         self._losses = state["losses"]
         self._episodes.set_state(state["episodes"])
-        if self._resumption is not None and self._resumption.run.opaque:
-            self._episodes.restart()
-        else:
+        if self._resumes_episodes():
             self._obs = state["obs"]
+        else:
+            self._episodes.restart()
+
+    def _resumes_episodes(self) -> bool:
+        """Whether the next step belongs to episodes that a resumed batch was in."""
+        return self._resumption is not None and "batch" not in self._resumption.run.opaque

@@ -14,6 +14,8 @@ from stable_baselines3.common.logger import (
     TensorBoardOutputFormat,
 )
 
+from sb3_flowpolicy.checkpoint.pickling import is_data
+
 
 def log_files(logger: Logger) -> dict[str, IO[str]]:
     """Return the files that a logger writes text to, by format."""
@@ -50,9 +52,12 @@ def write_texts(files: Mapping[str, IO[str]], texts: Mapping[str, str]) -> None:
 
 
 def log_state(logger: Logger) -> dict[str, Any]:
-    """Collect what a logger has written and what it is about to write."""
-    waiting = logger.name_to_value, logger.name_to_count, logger.name_to_excluded
-    return {"texts": read_texts(log_files(logger)), "waiting": [dict(part) for part in waiting]}
+    """Collect what a logger has written and what it is about to write, but for pictures."""
+    kept = {key for key, value in logger.name_to_value.items() if is_data(value)}
+    waiting = [
+        {key: value for key, value in part.items() if key in kept} for part in _waiting(logger)
+    ]
+    return {"texts": read_texts(log_files(logger)), "waiting": waiting}
 
 
 def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) -> None:
@@ -60,10 +65,9 @@ def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) 
 
     TensorBoard is told to hide what came after ``num_timesteps``.
     """
-    waiting = logger.name_to_value, logger.name_to_count, logger.name_to_excluded
-    for part, saved in zip(waiting, state["waiting"], strict=True):
-        part.clear()  # type: ignore[attr-defined]
-        part.update(saved)  # type: ignore[attr-defined]
+    for part, saved in zip(_waiting(logger), state["waiting"], strict=True):
+        part.clear()
+        part.update(saved)
     write_texts(log_files(logger), state["texts"])
     for one in logger.output_formats:
         if isinstance(one, CSVOutputFormat) and "CSVOutputFormat" in state["texts"]:
@@ -73,3 +77,8 @@ def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) 
             # The writer begins a new file with its next event, which says where to go on.
             one.writer.close()
             one.writer.purge_step = num_timesteps + 1
+
+
+def _waiting(logger: Logger) -> tuple[dict[str, Any], ...]:
+    """Return what is to be written next: values, how many each is the mean of, and not where."""
+    return logger.name_to_value, logger.name_to_count, logger.name_to_excluded

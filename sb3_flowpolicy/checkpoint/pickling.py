@@ -5,14 +5,35 @@ from __future__ import annotations
 import io
 import pickle
 import sys
+from collections import deque
 from collections.abc import Mapping
+from pathlib import Path
 from types import FunctionType
 from typing import Any
 
 import cloudpickle
+import numpy as np
+import torch as th
 
 # Their objects pickle as handles, which mean nothing in another process.
 _SIMULATORS = ("pybullet",)
+
+
+_DATA = (bool, int, float, str, bytes, Path, np.ndarray, np.generic, np.random.Generator, th.Tensor)
+
+
+def is_data(value: Any) -> bool:
+    """Whether a value is made of numbers, text and arrays, and can be pickled without surprise.
+
+    Example:
+        >>> is_data({"best": 1.5, "all": [1, 2]}), is_data(print)
+        (True, False)
+    """
+    if isinstance(value, Mapping):
+        return all(map(is_data, value.keys())) and all(map(is_data, value.values()))
+    if isinstance(value, list | tuple | set | deque):
+        return all(map(is_data, value))
+    return value is None or isinstance(value, _DATA)
 
 
 def dumps(value: Any, known: Mapping[str, object]) -> bytes:

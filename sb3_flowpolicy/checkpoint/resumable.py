@@ -68,13 +68,7 @@ class Resumable(OffPolicyAlgorithm):
         store, checkpoint = open_checkpoint(path, cls.__name__)
         venv = cls._wrap_env(maybe_make_env(env, 0))
         model = load_agent(cls, checkpoint, "model", venv, device)
-        run = model._describe_run()
-        model._resumption = take_up(run, store, checkpoint)
-        if run.opaque & set(run.environments):
-            model._last_obs = None
-            if model.seed is not None:
-                # Otherwise it would live through its first episodes once more.
-                venv.seed(model.seed + model.num_timesteps)
+        model._resumption = take_up(model._describe_run(), store, checkpoint)
         return model
 
     def learn(

@@ -6,10 +6,8 @@ import inspect
 import random
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +30,6 @@ _ATTRIBUTES = (
     "_planned",
     "_worth_compiling",
 )
-_DATA = (bool, int, float, str, bytes, Path, np.ndarray, np.generic, np.random.Generator, th.Tensor)
 
 
 @dataclass
@@ -123,6 +120,12 @@ def restore_early(run: Run, pickled: bytes) -> None:
         environments.set_layer_states(env, state["environments"][name])
         logs.write_texts(environments.monitor_files(env), state["monitors"][name])
     run.opaque = set(state["opaque"])
+    for name in run.opaque & set(run.agents):
+        agent = run.agents[name]
+        agent._last_obs = None
+        if agent.seed is not None and agent.env is not None:
+            # Otherwise it would live through its first episodes once more.
+            agent.env.seed(agent.seed + agent.num_timesteps)
     if run.opaque & set(run.environments):
         warnings.warn(
             "resuming begins new episodes, as the environment could not be saved: the run goes on, "
@@ -223,20 +226,12 @@ def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     return {
         key: value
         for key, value in vars(callback).items()
-        if key not in settings and _is_data(value)
+        if key not in settings and pickling.is_data(value)
     }
 
 
 def _arguments(kind: type) -> Iterable[str]:
     return inspect.signature(kind.__init__).parameters  # type: ignore[misc]
-
-
-def _is_data(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return all(map(_is_data, value.keys())) and all(map(_is_data, value.values()))
-    if isinstance(value, list | tuple | set | deque):
-        return all(map(_is_data, value))
-    return value is None or isinstance(value, _DATA)
 
 
 def _tree(root: BaseCallback) -> Iterator[BaseCallback]:

@@ -229,6 +229,29 @@ def test_monitor_files_are_those_of_the_undisturbed_run(tmp_path: Path) -> None:
     assert (tmp_path / "broken.monitor.csv").read_text().count("t_start") == 1
 
 
+def test_tensorboard_shows_one_run(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    path = tmp_path / "checkpoints"
+    checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": path}
+
+    def new(name: str) -> SACFlow:
+        return SACFlow("FlowPolicy", ENV, **FAST, tensorboard_log=str(tmp_path / name))
+
+    new("calm").learn(110, log_interval=2)
+    with pytest.raises(BrokenError):
+        new("broken").learn(110, log_interval=2, callback=BreakAt(57), **checkpoints)
+    SACFlow.resume(path, ENV).learn(110, log_interval=2, **checkpoints)
+    curves = []
+    for name in ("calm", "broken"):
+        assert [folder.name for folder in (tmp_path / name).iterdir()] == ["SACFlow_1"]
+        events = EventAccumulator(str(tmp_path / name / "SACFlow_1")).Reload()
+        curves.append([(one.step, one.value) for one in events.Scalars("rollout/ep_rew_mean")])
+    assert curves[0] == curves[1]
+    assert len(curves[0]) > 3
+
+
 def test_several_calls_of_learn(tmp_path: Path) -> None:
     """A program that is run again makes all its calls again: finished ones pass at once."""
 
