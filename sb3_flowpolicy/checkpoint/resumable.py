@@ -9,9 +9,11 @@ import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_flowpolicy.checkpoint.environments import check_same_build
 from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
 from sb3_flowpolicy.checkpoint.session import (
     Checkpoints,
@@ -70,6 +72,21 @@ class Resumable(OffPolicyAlgorithm):
         model = load_agent(cls, checkpoint, "model", venv, device)
         model._resumption = take_up(model._describe_run(), store, checkpoint)
         return model
+
+    def _resume_in_place(self, path: str | Path) -> None:
+        """Become the agent of the newest checkpoint, while :meth:`learn` is being set up."""
+        store, checkpoint = open_checkpoint(path, type(self).__name__)
+        check_same_build(self.env, checkpoint.manifest["layers"]["model"])
+        archive = checkpoint.folder / "model.zip"
+        _, parameters, variables = load_from_zip_file(archive, device=self.device)
+        self.set_parameters(parameters, device=self.device)
+        for name, value in (variables or {}).items():
+            if value is not None:
+                getattr(self, name).data.copy_(value.data)
+        self._resumption = take_up(self._describe_run(), store, checkpoint)
+        if self._last_obs is None:
+            assert self.env is not None
+            self._last_obs = self.env.reset()  # type: ignore[assignment]
 
     def learn(
         self: SelfResumable,

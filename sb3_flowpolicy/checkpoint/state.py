@@ -19,9 +19,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_flowpolicy.checkpoint import environments, logs, pickling
 from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
 
-# What SB3's load leaves out or makes anew.
+# What SB3's load leaves out or makes anew, and counters.
 _ATTRIBUTES = (
     "num_timesteps",
+    "_n_updates",
+    "_episode_num",
+    "ep_info_buffer",
+    "ep_success_buffer",
+    "_current_progress_remaining",
     "action_space",
     "_last_obs",
     "_last_original_obs",

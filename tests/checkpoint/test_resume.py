@@ -338,6 +338,17 @@ def test_without_further_checkpoints_and_by_callback(tmp_path: Path) -> None:
     left, right = _state(calm), _state(resumed)
     assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
     assert sorted(tmp_path.rglob("*")) == before
+    # The same command given again goes on, too, with a model that is new.
+    again = SACFlow("FlowPolicy", ENV, **FAST)
+    callback = RunCheckpointCallback(20, tmp_path, resume=True)
+    again.learn(80, callback=callback)
+    right = _state(again)
+    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert again.ep_info_buffer is not None
+    assert calm.ep_info_buffer is not None
+    assert [one["r"] for one in again.ep_info_buffer] == [one["r"] for one in calm.ep_info_buffer]
+    with pytest.raises(ValueError, match="empty folder for a new run"):
+        SACFlow("FlowPolicy", ENV, **FAST).learn(80, callback=RunCheckpointCallback(20, tmp_path))
     # A checkpoint's model is an ordinary one.
-    loaded = SACFlow.load(next(tmp_path.glob("*-step-40")) / "model.zip")
-    assert loaded.num_timesteps == 40
+    loaded = SACFlow.load(next(tmp_path.glob("*-step-80")) / "model.zip")
+    assert loaded.num_timesteps == 80
