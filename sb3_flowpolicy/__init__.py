@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_flowpolicy.bundle import BundleError
+    from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
     from sb3_flowpolicy.export import export_onnx
     from sb3_flowpolicy.finite import NonFiniteError
@@ -42,9 +43,11 @@ __all__ = [
     "MultiInputGaussPolicy",
     "MultiInputLowRankPolicy",
     "NonFiniteError",
+    "RunCheckpointCallback",
     "SACFlow",
     "SeedBatch",
     "export_onnx",
+    "has_checkpoint",
     "register_distribution",
 ]
 
@@ -52,9 +55,11 @@ _ELSEWHERE = {
     "ActionDistribution": "distributions",
     "BundleError": "bundle",
     "NonFiniteError": "finite",
+    "RunCheckpointCallback": "checkpoint",
     "SACFlow": "sac_flow",
     "SeedBatch": "seed_batch",
     "export_onnx": "export",
+    "has_checkpoint": "checkpoint",
     "register_distribution": "distributions",
 }
 

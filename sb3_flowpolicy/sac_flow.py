@@ -6,7 +6,7 @@ import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
@@ -16,11 +16,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
-from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
+from sb3_flowpolicy.bundle.shareable import Shareable
+from sb3_flowpolicy.checkpoint import Resumable
 from sb3_flowpolicy.demonstrations import (
     fill_replay_buffer,
     follow_recipe,
@@ -30,7 +30,6 @@ from sb3_flowpolicy.demonstrations import (
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
 from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
 from sb3_flowpolicy.guard import TrainingGuard
-from sb3_flowpolicy.policies.deterministic import DETERMINISTIC_DEFAULTS
 from sb3_flowpolicy.policies.sac import DistributionPolicy, check_finite_actions
 from sb3_flowpolicy.settings import check_settings
 
@@ -42,10 +41,8 @@ MOST_DRAWN_AT_ONCE = 1000
 # Names of SAC's arguments after self, policy and env, for those that come by position.
 _SAC_ARGUMENTS = list(inspect.signature(SAC.__init__).parameters)[3:]
 
-SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
 
-
-class SACFlow(SAC):
+class SACFlow(Resumable, Shareable, SAC):
     r"""Soft Actor-Critic with action distributions that correlate and bend.
 
     Everything of SB3's :class:`~stable_baselines3.SAC` holds. In particular a fixed temperature
@@ -88,9 +85,6 @@ class SACFlow(SAC):
         >>> model = SACFlow("FlowPolicy", "Pendulum-v1", ent_coef=0.1, random_steps=20, seed=0)
         >>> _ = model.learn(30)
     """
-
-    #: What a bundle that was loaded without environment says about ``VecNormalize``.
-    normalization: Normalization | None = None
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": policies.FlowPolicy,
@@ -192,11 +186,14 @@ class SACFlow(SAC):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         self._guard.restart()
+        self._guard.resume_from = None if self._checkpoints is None else self._checkpoints.path
         normalized = self._vec_normalize_env is not None
         first = self._last_original_obs if normalized else self._last_obs
         check_experience({"observations": first}, self.num_timesteps, ENVIRONMENT)
-        # Many short calls of learn(), with tests in between say, are a long run as well.
-        self._planned += self._planned_updates(total_timesteps)
+        # Many short calls of learn(), with tests in between say, are a long run as well; a resumed
+        # one was counted when it began.
+        if self._resumption is None:
+            self._planned += self._planned_updates(total_timesteps)
         self._worth_compiling = self._planned >= UPDATES_WORTH_COMPILING
         self._engine_refused = False
         if why_unsupported(self) is not None:
@@ -333,90 +330,22 @@ class SACFlow(SAC):
         assert isinstance(self.train_freq, TrainFreq)
         return steps / self.env.num_envs * self.gradient_steps / self.train_freq.frequency
 
-    def learn(
-        self: SelfSACFlow,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "SACFlow",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfSACFlow:
-        """Train as SB3's ``SAC.learn`` does; same arguments, same return value.
-
-        Raises:
-            NonFiniteError: If the environment hands out, or training arrives at, NaN or infinity;
-                see :class:`~sb3_flowpolicy.guard.TrainingGuard`.
-        """
-        super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )
+    def _on_learning_end(self) -> None:
         self._guard.look()
-        return self
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """Save as SB3 does; a ``deterministic_mode`` that was set later on is saved as well."""
-        self._note_policy_settings()
+        if isinstance(self.policy, DistributionPolicy):
+            self.policy_kwargs = self.policy.up_to_date(self.policy_kwargs)
         super().save(path, exclude, include)
 
-    def _note_policy_settings(self) -> None:
-        if isinstance(self.policy, DistributionPolicy):
-            before = {**DETERMINISTIC_DEFAULTS, **self.policy_kwargs}
-            now = self.policy.deterministic_settings()
-            changed = {key: value for key, value in now.items() if value != before[key]}
-            self.policy_kwargs = {**self.policy_kwargs, **changed}
+    def _extra_state(self) -> dict[str, Any]:
+        # Whoever acts with an engine draws other numbers than whoever acts without.
+        return {"engine": self._engine is not None}
 
-    def save_safe(self, path: str | Path, vec_normalize: VecNormalize | None = None) -> Path:
-        """Write a safe bundle: one file that can be shared, as loading it executes nothing.
-
-        It holds the policy, target networks, optimisers, temperature, all settings, and the
-        statistics of ``VecNormalize``; not the replay buffer. ``docs/guide/sharing.md`` tells more.
-
-        Args:
-            path: File to write, ``.safetensors`` where it has no suffix.
-            vec_normalize: Statistics to include. Default: those of the model's environment.
-
-        Returns:
-            The file's path.
-
-        Raises:
-            ValueError: If the model has a part that needs code, such as a features extractor of
-                your own or a learning rate that is a function; the message names it.
-
-        Example:
-            >>> import tempfile
-            >>> model = SACFlow("FlowPolicy", "Pendulum-v1")
-            >>> path = model.save_safe(tempfile.mkdtemp() + "/pendulum")
-            >>> SACFlow.load_safe(path).predict(np.zeros(3), deterministic=True)[0].shape
-            (1,)
-        """
-        self._note_policy_settings()
-        return save_bundle(self, path, vec_normalize)
-
-    @classmethod
-    def load_safe(
-        cls: type[SelfSACFlow],
-        path: str | Path,
-        env: GymEnv | str | None = None,
-        device: th.device | str = "auto",
-    ) -> SelfSACFlow:
-        """Read what :meth:`save_safe` wrote, without executing anything the file says.
-
-        Args:
-            path: The file.
-            env: Environment to train on in, as it was before any ``VecNormalize``: if the model
-                has statistics, they are wrapped around it. Default: none, to predict only;
-                observations then go through ``model.normalization`` where that is not None.
-            device: Where the model goes.
-
-        Returns:
-            The model.
-
-        Raises:
-            BundleError: A ``ValueError``, if anything in the file is not as it was written.
-            ValueError: If ``env`` has other spaces.
-        """
-        return load_bundle(cls, path, env, device)
+    def _set_extra_state(self, state: dict[str, Any]) -> None:
+        if state["engine"]:
+            self._ready_engine()
 
     def _excluded_save_params(self) -> list[str]:
         engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned", "_guard"]

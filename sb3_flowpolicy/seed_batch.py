@@ -14,14 +14,19 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_flowpolicy.checkpoint.session import (
+    between_rollouts,
+    finishing,
+    start_checkpoints,
+)
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.finite import check_experience
 from sb3_flowpolicy.guard import TrainingGuard
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_checkpoint import read_batch, write_batch
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
+from sb3_flowpolicy.seed_on_disk import BatchOnDisk
 from sb3_flowpolicy.seed_setup import (
     CallbackFactory,
     EnvFactory,
@@ -37,7 +42,7 @@ from sb3_flowpolicy.seed_setup import (
 _COMMON = ("batch_size", "gamma", "learning_starts", "random_steps", "train_freq", "gradient_steps")
 
 
-class SeedBatch:
+class SeedBatch(BatchOnDisk):
     """Train S independent :class:`SACFlow` agents in one process, by stacking their networks.
 
     Each seed has its own environment, replay buffer, random numbers and logs; given the same
@@ -130,8 +135,10 @@ class SeedBatch:
         tb_log_name: str = "SACFlow",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        checkpoint_every: int | None = None,
+        checkpoint_path: str | Path | None = None,
     ) -> SeedBatch:
-        """Train all agents; the arguments are those of SB3's ``learn``.
+        """Train all agents; the arguments are those of :meth:`SACFlow.learn`.
 
         Args:
             total_timesteps: Environment steps per agent.
@@ -142,6 +149,9 @@ class SeedBatch:
             tb_log_name: Name of the TensorBoard runs, which get ``_seed<seed>`` appended.
             reset_num_timesteps: Whether to count from zero, or to go on.
             progress_bar: Whether to show one.
+            checkpoint_every: Environment steps per agent between two checkpoints that
+                :meth:`resume` goes on from.
+            checkpoint_path: Folder for them, empty for a new run.
 
         Returns:
             Itself.
@@ -150,9 +160,21 @@ class SeedBatch:
             NonFiniteError: If an environment hands out, or training arrives at, NaN or infinity;
                 see :class:`~sb3_flowpolicy.guard.TrainingGuard`.
         """
-        callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
+        with finishing(self):
+            start_checkpoints(self, checkpoint_path, checkpoint_every)
+            callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
+            self._learn(callbacks, log_interval, reset_num_timesteps, progress_bar)
+        return self
+
+    def _learn(
+        self,
+        callbacks: list[BaseCallback],
+        log_interval: int | None,
+        reset_num_timesteps: bool,
+        progress_bar: bool,
+    ) -> None:
         first = self._models[0]
-        if self._obs is None or reset_num_timesteps:
+        if not self._resumes_episodes() and (self._obs is None or reset_num_timesteps):
             # Typed as one seed, documented as one per environment.
             # Who goes on after saving must not see the same episodes again.
             seeds = [seed + first.num_timesteps for seed in self.seeds]
@@ -173,15 +195,18 @@ class SeedBatch:
             self._engine.release()
         for one in callbacks:
             one.on_training_end()
-        return self
 
     def _run(self, callbacks: list[BaseCallback], log_interval: int | None, bar: Any) -> None:
         """Alternate between collecting and updating, as SB3 does."""
         first = self._models[0]
         assert isinstance(first.train_freq, TrainFreq)
         frequency, total = first.train_freq.frequency, first._total_timesteps
+        # One callback per agent, or none at all.
+        named = dict(zip(self._describe_run().agents, callbacks, strict=False))
         going = True
         while going and first.num_timesteps < total:
+            if not between_rollouts(self, named):
+                break
             for one in callbacks:
                 one.on_rollout_start()
             collected = 0
@@ -198,50 +223,6 @@ class SeedBatch:
                     check_stackable(first)
                 self._train()
 
-    def save(self, folder: str | Path) -> None:
-        """Save all agents, their replay buffers and their random numbers.
-
-        The running episodes are not saved: a loaded batch begins new ones.
-
-        Args:
-            folder: Where to; one ``seed_<seed>.zip`` and ``.buffer.pkl`` per agent, which can also
-                be loaded on their own, and ``batch.pt``.
-        """
-        noise = {name: one.state() for name, one in self._noise.items()}
-        write_batch(folder, self.seeds, self._models, noise)
-        self._obs = None
-
-    @classmethod
-    def load(
-        cls,
-        folder: str | Path,
-        env: str | EnvFactory,
-        algorithm: type[SACFlow] = SACFlow,
-        monitor_dir: str | Path | None = None,
-        info_keywords: Sequence[str] = (),
-    ) -> SeedBatch:
-        """Load what :meth:`save` wrote; ``learn(..., reset_num_timesteps=False)`` goes on.
-
-        Args:
-            folder: Folder of a saved batch.
-            env: As at construction.
-            algorithm: Class of the agents.
-            monitor_dir: As at construction.
-            info_keywords: As at construction.
-
-        Returns:
-            The batch.
-
-        Raises:
-            ValueError: If the folder holds no complete batch.
-        """
-        seeds, models, noise = read_batch(folder, env, algorithm)
-        batch = cls.__new__(cls)
-        batch._adopt(models, seeds, env, monitor_dir, info_keywords)
-        for name, state in noise.items():
-            batch._noise[name].set_state(state)
-        return batch
-
     def _start(
         self,
         total_timesteps: int,
@@ -255,7 +236,15 @@ class SeedBatch:
             own = copy_callback(callback, seed)
             name = f"{tb_log_name}_seed{seed}"
             # SB3 draws the first observation from the model's own environment; ours are stepped.
+            model._resumption = self._resumption
             _, ready = model._setup_learn(total_timesteps, own, reset_num_timesteps, name)
+            model._resumption = None
+            if model._checkpoints is not None and model._checkpoints.active:
+                model._checkpoints.stop()
+                raise ValueError(
+                    "a batch is checkpointed by learn(checkpoint_every=..., checkpoint_path=...), "
+                    "got a callback that does so for each agent"
+                )
             ready.on_training_start({"self": model}, {})
             callbacks += [ready] if own is not None else []
         self._take_over()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
 
 
 class SeedEpisodes:
@@ -102,3 +104,21 @@ class SeedEpisodes:
         """Forget the running episodes: their environments were reset."""
         self.returns[:] = 0
         self.lengths[:] = 0
+
+    def state(self) -> dict[str, Any]:
+        """Return what is needed to go on with the running episodes."""
+        return {
+            "returns": self.returns,
+            "lengths": self.lengths,
+            "start": self.start,
+            "texts": read_texts(self._files()),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state` was taken."""
+        self.returns, self.lengths = state["returns"], state["lengths"]
+        self.start = state["start"]
+        write_texts(self._files(), state["texts"])
+
+    def _files(self) -> dict[str, IO[str]]:
+        return {str(index): writer.file_handler for index, writer in enumerate(self.writers)}

@@ -38,6 +38,7 @@ from sb3_flowpolicy.bundle.policy_spec import (
 from sb3_flowpolicy.bundle.replay_spec import buffer_from_spec, buffer_to_spec
 from sb3_flowpolicy.bundle.schedules import rate_from_spec, rate_to_spec
 from sb3_flowpolicy.bundle.space_specs import space_from_spec, space_to_spec
+from sb3_flowpolicy.policies import DistributionPolicy
 from sb3_flowpolicy.settings import SETTINGS, Check, integer, number
 
 SUFFIX = ".safetensors"
@@ -91,6 +92,8 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model must be finite to be worth sharing, got NaN or inf in {name}")
+    policy_name, policy = policy_class_name(model.policy_class), model.policy
+    assert isinstance(policy, DistributionPolicy)
     known = normalization_of(model, vec_normalize)
     spec = None if known is None else normalization_to_spec("normalization", known, arrays)
     config = {
@@ -98,8 +101,8 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
         "made_with": _made_with(),
         "observation_space": space_to_spec("observation_space", model.observation_space, arrays),
         "action_space": space_to_spec("action_space", model.action_space, arrays),
-        "policy": policy_class_name(model.policy_class),
-        "policy_kwargs": kwargs_to_spec(model.policy_kwargs),
+        "policy": policy_name,
+        "policy_kwargs": kwargs_to_spec(policy.up_to_date(model.policy_kwargs)),
         "settings": {
             "learning_rate": rate_to_spec("learning_rate", model.learning_rate),
             **{name: check(name, _attribute(model, name)) for name, check in SETTINGS.items()},

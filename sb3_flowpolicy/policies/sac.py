@@ -147,8 +147,14 @@ class DistributionPolicy(SACPolicy):
         if not self.training == self.actor.training == self.critic.training == mode:
             super().set_training_mode(mode)
 
-    def deterministic_settings(self) -> dict[str, Any]:
-        """Return the settings that may be set after construction, by name."""
+    def up_to_date(self, policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """Return ``policy_kwargs`` with what was set after construction."""
+        before = {**DETERMINISTIC_DEFAULTS, **policy_kwargs}
+        now = self._deterministic_settings()
+        changed = {name: value for name, value in now.items() if value != before[name]}
+        return {**policy_kwargs, **changed}
+
+    def _deterministic_settings(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in DETERMINISTIC_DEFAULTS}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -156,7 +162,7 @@ class DistributionPolicy(SACPolicy):
         data.update(
             distribution=self.distribution,
             distribution_kwargs=self.distribution_kwargs,
-            **self.deterministic_settings(),
+            **self._deterministic_settings(),
             # Missing in SB3's: a policy that shares its extractor would load as one that does not.
             share_features_extractor=self.share_features_extractor,
         )

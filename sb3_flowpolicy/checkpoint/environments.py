@@ -1,0 +1,76 @@
+"""The state of environments, layer by layer, put into new ones of the same build."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import IO, Any
+
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
+
+# How an environment was made, and open files: nothing that steps change.
+_NOT_STATE = {"class_attributes", "env_fns", "spec", "_cached_spec", "results_writer"}
+
+LayerStates = dict[str, dict[str, Any]]
+
+
+def layers(env: Any) -> dict[str, Any]:
+    """Name the wrappers and environments that an environment consists of, from the outside in.
+
+    Args:
+        env: SB3's ``VecEnv``, gymnasium's ``VectorEnv`` or ``Env``.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> list(layers(gym.make("Pendulum-v1")))[:2]
+        ['0:TimeLimit', '0.0:OrderEnforcing']
+    """
+    found: dict[str, Any] = {}
+    waiting = [("0", env)]
+    while waiting:
+        place, layer = waiting.pop(0)
+        found[f"{place}:{type(layer).__name__}"] = layer
+        attributes = vars(layer)
+        inside = [attributes[name] for name in ("venv", "env") if name in attributes]
+        inside += attributes.get("envs", [])
+        waiting += [(f"{place}.{index}", part) for index, part in enumerate(inside)]
+    return found
+
+
+def layer_states(env: Any, outside_only: bool = False) -> LayerStates:
+    """Collect what steps may change, of every layer; not copied.
+
+    Args:
+        env: The environment.
+        outside_only: Leave out what may not be possible to pickle: all but SB3's wrappers around
+            vectorised environments, such as ``VecNormalize``.
+    """
+    return {
+        name: {key: value for key, value in vars(layer).items() if key not in _NOT_STATE}
+        for name, layer in layers(env).items()
+        if not outside_only or isinstance(layer, VecEnvWrapper)
+    }
+
+
+def set_layer_states(env: Any, states: Mapping[str, Mapping[str, Any]]) -> None:
+    """Put states that :func:`layer_states` collected into an environment of the same build."""
+    for name, layer in layers(env).items():
+        vars(layer).update(states.get(name, {}))
+
+
+def check_same_build(env: Any, names: list[str]) -> None:
+    """Raise ``ValueError`` unless the environment consists of the layers of these names."""
+    if list(layers(env)) != names:
+        raise ValueError(
+            "env must be built and wrapped as when the checkpoint was written, expected "
+            f"{' > '.join(names)}, got {' > '.join(layers(env))}"
+        )
+
+
+def monitor_files(env: Any) -> dict[str, IO[str]]:
+    """Return the open files of SB3's ``Monitor`` wrappers, by layer."""
+    return {
+        name: layer.results_writer.file_handler
+        for name, layer in layers(env).items()
+        if isinstance(layer, Monitor) and layer.results_writer is not None
+    }

@@ -1,0 +1,84 @@
+"""What a run has logged: log files as they were, and values that wait to be written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from stable_baselines3.common.logger import (
+    CSVOutputFormat,
+    HumanOutputFormat,
+    JSONOutputFormat,
+    Logger,
+    TensorBoardOutputFormat,
+)
+
+from sb3_flowpolicy.checkpoint.pickling import is_data
+
+
+def log_files(logger: Logger) -> dict[str, IO[str]]:
+    """Return the files that a logger writes text to, by format."""
+    files: dict[str, IO[str]] = {}
+    for one in logger.output_formats:
+        if isinstance(one, CSVOutputFormat | JSONOutputFormat):
+            files[type(one).__name__] = one.file
+        if isinstance(one, HumanOutputFormat) and one.own_file:
+            files[type(one).__name__] = one.file
+    return files
+
+
+def read_texts(files: Mapping[str, IO[str]]) -> dict[str, str]:
+    """Read open files; those that were deleted are left out.
+
+    A file as a whole, not its length: whoever opens a log again empties it first.
+    """
+    texts = {}
+    for name, file in files.items():
+        file.flush()
+        if Path(file.name).is_file():
+            texts[name] = Path(file.name).read_text()
+    return texts
+
+
+def write_texts(files: Mapping[str, IO[str]], texts: Mapping[str, str]) -> None:
+    """Replace the contents of open files; files without a text stay as they are."""
+    for name, file in files.items():
+        if name in texts:
+            file.seek(0)
+            file.truncate()
+            file.write(texts[name])
+            file.flush()
+
+
+def log_state(logger: Logger) -> dict[str, Any]:
+    """Collect what a logger has written and what it is about to write, but for pictures."""
+    kept = {key for key, value in logger.name_to_value.items() if is_data(value)}
+    waiting = [
+        {key: value for key, value in part.items() if key in kept} for part in _waiting(logger)
+    ]
+    return {"texts": read_texts(log_files(logger)), "waiting": waiting}
+
+
+def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) -> None:
+    """Go on where :func:`log_state` was taken.
+
+    TensorBoard is told to hide what came after ``num_timesteps``.
+    """
+    for part, saved in zip(_waiting(logger), state["waiting"], strict=True):
+        part.clear()
+        part.update(saved)
+    write_texts(log_files(logger), state["texts"])
+    for one in logger.output_formats:
+        if isinstance(one, CSVOutputFormat) and "CSVOutputFormat" in state["texts"]:
+            header = state["texts"]["CSVOutputFormat"].partition("\n")[0]
+            one.keys = header.split(one.separator) if header else []
+        elif isinstance(one, TensorBoardOutputFormat):
+            # The writer begins a new file with its next event, which says where to go on.
+            one.writer.close()
+            one.writer.purge_step = num_timesteps + 1
+
+
+def _waiting(logger: Logger) -> tuple[dict[str, Any], ...]:
+    """Return what is to be written next: values, how many each is the mean of, and not where."""
+    return logger.name_to_value, logger.name_to_count, logger.name_to_excluded

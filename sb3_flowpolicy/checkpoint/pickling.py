@@ -1,0 +1,94 @@
+"""Pickles of objects that refer to others which exist already: environments, agents, callbacks."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import sys
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import torch as th
+
+# Their objects pickle as handles, which mean nothing in another process.
+_SIMULATORS = ("pybullet",)
+
+
+_DATA = (bool, int, float, str, bytes, Path, np.ndarray, np.generic, np.random.Generator, th.Tensor)
+
+
+def is_data(value: Any) -> bool:
+    """Whether a value is made of numbers, text and arrays, and can be pickled without surprise.
+
+    Example:
+        >>> is_data({"best": 1.5, "all": [1, 2]}), is_data(print)
+        (True, False)
+    """
+    if isinstance(value, Mapping):
+        return all(map(is_data, value.keys())) and all(map(is_data, value.values()))
+    if isinstance(value, list | tuple | set | deque):
+        return all(map(is_data, value))
+    return value is None or isinstance(value, _DATA)
+
+
+def dumps(value: Any, known: Mapping[str, object]) -> bytes:
+    """Pickle ``value``; objects in ``known`` are noted by name, whatever they hold.
+
+    Args:
+        value: What to pickle.
+        known: Name -> object that :func:`loads` will be given another one for.
+
+    Raises:
+        Exception: Of any kind, if something cannot be pickled.
+    """
+    file = io.BytesIO()
+    _Pickler(file, {id(thing): name for name, thing in known.items()}).dump(value)
+    return file.getvalue()
+
+
+def loads(pickled: bytes, known: Mapping[str, object]) -> Any:
+    """Unpickle what :func:`dumps` returned; names that are not ``known`` become None.
+
+    Raises:
+        ValueError: If it refers to a class or function that this program does not have.
+    """
+    try:
+        return _Unpickler(io.BytesIO(pickled), known).load()
+    except (AttributeError, ImportError) as error:
+        raise ValueError(
+            f"the program must define what the checkpoint was written with: {error}"
+        ) from error
+
+
+class _Pickler(cloudpickle.Pickler):
+    def __init__(self, file: io.BytesIO, names: Mapping[int, str]) -> None:
+        super().__init__(file)
+        self._names = names
+
+    def persistent_id(self, thing: object) -> str | None:
+        name = self._names.get(id(thing))
+        if name is None and type(thing).__module__.startswith(_SIMULATORS):
+            raise pickle.PicklingError(f"{type(thing).__name__} lives outside of Python")
+        return name
+
+    def reducer_override(self, thing: Any) -> Any:
+        # cloudpickle would copy what the main program defines: a resumed program, which defines it
+        # again, would then have two classes that are not each other.
+        named = isinstance(thing, type | FunctionType) and thing.__module__ == "__main__"
+        if named and getattr(sys.modules["__main__"], thing.__qualname__, None) is thing:
+            return NotImplemented
+        return super().reducer_override(thing)
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, known: Mapping[str, object]) -> None:
+        super().__init__(file)
+        self._known = known
+
+    def persistent_load(self, name: str) -> object:
+        return self._known.get(name)

@@ -1,0 +1,222 @@
+"""A folder of checkpoints: written atomically, checked when read, the last good ones kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+FORMAT = 1
+"""Version of what is on disk; raised when older versions of this package could not read it."""
+
+KEPT = 2
+_MANIFEST = "manifest.json"
+_ROWS = "replay"
+_PARTIAL = ".partial"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A complete checkpoint.
+
+    Args:
+        folder: Where its files are.
+        manifest: What it says about itself: ``kind``, ``num_timesteps``, ``segments``, ...
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+
+    @property
+    def rows_folder(self) -> Path:
+        """Where the files of the replay buffer are, which several checkpoints share."""
+        return self.folder.parent / _ROWS
+
+
+class CheckpointStore:
+    """The checkpoints of one run.
+
+    A checkpoint is a folder ``00007-step-70000``. Its files and the rows that are new since the one
+    before are written and synchronised under other names first; renaming the folder completes it. A
+    manifest lists the SHA-256 of every file, those of earlier rows included.
+
+    Args:
+        path: The folder; made when the first checkpoint is written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._good: list[Checkpoint] = []
+
+    def folders(self) -> list[Path]:
+        """Return the folders of checkpoints, oldest first, be they damaged or not."""
+        return sorted(self.path.glob("[0-9]*-step-*"), key=_number)
+
+    def newest(self) -> Checkpoint:
+        """Return the newest checkpoint that is undamaged.
+
+        Raises:
+            ValueError: If there is none, or it was written in a later format.
+        """
+        folders = self.folders()
+        damages = []
+        for folder in reversed(folders):
+            try:
+                checkpoint = Checkpoint(folder, _read_manifest(folder))
+            except _DamagedError as damage:
+                damages.append(f"{folder.name}: {damage}")
+                continue
+            if damages:
+                warnings.warn(
+                    f"resuming from {folder}, because newer checkpoints are damaged "
+                    f"({'; '.join(damages)})",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
+            self._good = [checkpoint]
+            return checkpoint
+        found = f"only damaged ones ({'; '.join(damages)})" if damages else "none"
+        raise ValueError(
+            f"path must be a folder of checkpoints, got {self.path}, which has {found}"
+        )
+
+    def write(
+        self,
+        num_timesteps: int,
+        facts: dict[str, Any],
+        write_files: Callable[[Path, Path], dict[str, Any]],
+    ) -> Checkpoint:
+        """Write a checkpoint, then delete those that are not needed any more.
+
+        Args:
+            num_timesteps: Environment steps so far.
+            facts: What the manifest says.
+            write_files: Function of the checkpoint's folder and of a path for new rows; writes
+                files and returns more facts, among them the ``segments`` that hold the rows.
+
+        Returns:
+            The checkpoint.
+        """
+        number = max(map(_number, self.folders()), default=0) + 1
+        name = f"{number:05d}-step-{num_timesteps}"
+        partial, rows = self.path / f"{_PARTIAL}-{name}", self.path / _ROWS
+        for leftover in self.path.glob(f"{_PARTIAL}-*"):
+            shutil.rmtree(leftover)
+        partial.mkdir(parents=True)
+        rows.mkdir(exist_ok=True)
+        new_rows = rows / f"{number:05d}.npz"
+        new_rows.unlink(missing_ok=True)
+        facts = {"format": FORMAT, "num_timesteps": num_timesteps, **facts}
+        facts |= write_files(partial, new_rows)
+        own = {f"{name}/{path.name}": _digest(path, True) for path in sorted(partial.iterdir())}
+        known = self._good[-1].manifest["files"] if self._good else {}
+        for segment in facts.get("segments", []):
+            key = f"{_ROWS}/{segment['file']}"
+            own[key] = known[key] if key in known else _digest(self.path / key, True)
+        facts["files"] = own
+        manifest = partial / _MANIFEST
+        manifest.write_text(json.dumps({**facts, "sha256": _seal(facts)}, indent=1))
+        for path in (manifest, partial, rows):
+            _synchronize(path)
+        partial.rename(self.path / name)
+        _synchronize(self.path)
+        checkpoint = Checkpoint(self.path / name, facts)
+        self._good = [*self._good, checkpoint][-KEPT:]
+        self._tidy()
+        return checkpoint
+
+    def _tidy(self) -> None:
+        """Delete checkpoints beyond the last good ones, and rows that none of these needs."""
+        kept = {checkpoint.folder for checkpoint in self._good}
+        for folder in self.folders():
+            if folder not in kept:
+                shutil.rmtree(folder)
+        needed = {name for checkpoint in self._good for name in checkpoint.manifest["files"]}
+        for path in (self.path / _ROWS).iterdir():
+            if f"{_ROWS}/{path.name}" not in needed:
+                path.unlink()
+
+
+def has_checkpoint(path: str | Path) -> bool:
+    """Whether a run can be resumed from a folder, to decide between that and a new one.
+
+    Example:
+        >>> has_checkpoint("no/such/folder")
+        False
+    """
+    return any(not _damage(folder) for folder in reversed(CheckpointStore(path).folders()))
+
+
+def _number(folder: Path) -> int:
+    return int(folder.name.split("-")[0])
+
+
+class _DamagedError(Exception):
+    """A checkpoint is not what its manifest says."""
+
+
+def _damage(folder: Path) -> str:
+    try:
+        _read_manifest(folder)
+    except _DamagedError as damage:
+        return str(damage)
+    return ""
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    """Read a manifest and check what it says about files."""
+    try:
+        facts = json.loads((folder / _MANIFEST).read_bytes())
+        seal = facts.pop("sha256")
+    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+        raise _DamagedError(f"{_MANIFEST} cannot be read") from None
+    if seal != _seal(facts):
+        raise _DamagedError(f"{_MANIFEST} was altered")
+    if facts["format"] > FORMAT:
+        raise ValueError(
+            f"path must hold checkpoints of format {FORMAT} or earlier, got format "
+            f"{facts['format']} in {folder}: a newer sb3_flowpolicy wrote it"
+        )
+    for name, digest in facts["files"].items():
+        path = folder.parent / name
+        if not path.is_file():
+            raise _DamagedError(f"{name} is missing")
+        if _digest(path) != digest:
+            raise _DamagedError(f"{name} was altered or cut short")
+    return facts
+
+
+def _seal(facts: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _digest(path: Path, synchronize: bool = False) -> str:
+    """Return a file's SHA-256, and see to it that the file is on the disk."""
+    if synchronize:
+        _synchronize(path)
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        for block in _blocks(file):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _blocks(file: Any) -> Iterable[bytes]:
+    return iter(lambda: file.read(1 << 20), b"")
+
+
+def _synchronize(path: Path) -> None:
+    """Wait until a file's contents, or a folder's entries, are on the disk."""
+    if path.is_dir() and os.name == "nt":
+        return  # Windows has no handles of folders to wait for
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

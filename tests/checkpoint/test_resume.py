@@ -1,0 +1,354 @@
+"""A run that was broken off and resumed is the run that was not, bit for bit."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.sac.policies import SACPolicy
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy.checkpoint import RunCheckpointCallback
+from sb3_flowpolicy.vec_env import make_batched_env
+from tests.checkpoint.kill_and_resume import _outcome, _rows
+
+ENV = "TunnelDiagonal-v0"
+FAST: dict[str, Any] = {
+    "learning_starts": 20,
+    "buffer_size": 70,
+    "batch_size": 8,
+    "seed": 0,
+    "device": "cpu",
+    "policy_kwargs": {"net_arch": [8]},
+}
+TOTAL, EVERY, BREAKS = 110, 20, (47, 92)
+
+
+class BrokenError(Exception):
+    """What a run dies of here."""
+
+
+class BreakAt(BaseCallback):
+    """Breaks a run off in the middle of a rollout."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.step:
+            raise BrokenError
+        return True
+
+
+def run_to(
+    step: int | None,
+    make_env: Callable[[], Any],
+    path: Path | None,
+    settings: dict[str, Any],
+    callbacks: Callable[[], list[BaseCallback]] = list,
+    resume: bool = False,
+) -> SACFlow:
+    """Train, or go on training, to the end or until it breaks."""
+    # What other programs draw must not matter.
+    th.manual_seed(123)
+    np.random.seed(123)  # noqa: NPY002
+    env = make_env()
+    model = SACFlow.resume(path, env) if resume and path else SACFlow(env=env, **settings)
+    if path is not None:
+        model.set_logger(configure(str(path.parent / "log"), ["csv", "json"]))
+    else:
+        model.set_logger(configure(str(settings["tensorboard_log"]), ["csv", "json"]))
+    listed = callbacks() + ([] if step is None else [BreakAt(step)])
+    checkpoints = {} if path is None else {"checkpoint_every": EVERY, "checkpoint_path": path}
+    try:
+        model.learn(TOTAL, callback=listed, log_interval=2, **checkpoints)
+    except BrokenError:
+        assert step is not None
+    return model
+
+
+def differences(
+    make_env: Callable[[], Any],
+    tmp_path: Path,
+    callbacks: Callable[[], list[BaseCallback]] = list,
+    **changes: Any,
+) -> list[str]:
+    """Compare a run with one that was broken off twice; also their logs."""
+    settings = {
+        "policy": "FlowPolicy",
+        **FAST,
+        **changes,
+        "tensorboard_log": str(tmp_path / "calm"),
+    }
+    calm = run_to(None, make_env, None, settings, callbacks)
+    path = tmp_path / "broken" / "checkpoints"
+    run_to(BREAKS[0], make_env, path, settings, callbacks)
+    run_to(BREAKS[1], make_env, path, settings, callbacks, resume=True)
+    resumed = run_to(None, make_env, path, settings, callbacks, resume=True)
+    assert resumed.num_timesteps == calm.num_timesteps >= TOTAL
+    assert calm._n_updates > 0
+    left, right = _state(calm), _state(resumed)
+    assert left.keys() == right.keys()
+    found = [name for name, value in left.items() if not th.equal(value, right[name])]
+    logs = [_rows(folder / "progress.csv") for folder in (tmp_path / "calm", path.parent / "log")]
+    assert len(logs[0]) > 2
+    return found + (["log"] if logs[0] != logs[1] else [])
+
+
+def _state(model: SACFlow) -> dict[str, th.Tensor]:
+    """Everything that training changes, of any kind of replay buffer."""
+    if isinstance(model.observation_space, gym.spaces.Dict):
+        buffer: Any = model.replay_buffer
+        model.replay_buffer = None
+        arrays = {f"obs {key}": value for key, value in buffer.observations.items()}
+        arrays |= {"actions": buffer.actions, "rewards": buffer.rewards, "dones": buffer.dones}
+        found = {name: th.from_numpy(value) for name, value in arrays.items()}
+        found |= {f"p {key}": value for key, value in model.policy.state_dict().items()}
+        return found
+    found = _outcome(model)
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None:
+        found["mean"] = th.from_numpy(np.asarray(normalize.obs_rms.mean))  # type: ignore[union-attr]
+        found["returns"] = th.from_numpy(normalize.returns)
+    return found
+
+
+def normalized() -> VecEnv:
+    return VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, wrapper_class=short))
+
+
+def short(env: gym.Env) -> gym.Env:
+    return gym.wrappers.TimeLimit(env.unwrapped, 13)
+
+
+VARIANTS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
+    "plain": (lambda: gym.make(ENV), {}),
+    "fixed temperature, another density": (
+        lambda: gym.make("TunnelCircle-v0"),
+        {"policy": "LowRankPolicy", "ent_coef": 0.1, "random_steps": 40},
+    ),
+    "several normalised environments": (normalized, {"learning_rate": lambda left: left * 1e-3}),
+    "stacked frames": (lambda: VecFrameStack(make_vec_env(ENV, n_envs=2), 3), {"train_freq": 3}),
+    "batched environments": (lambda: make_batched_env("SquareHold-v0", 2), {}),
+    "updates per episode": (lambda: gym.make(ENV), {"train_freq": (1, "episode")}),
+    "n-step returns": (lambda: gym.make(ENV), {"n_steps": 3}),
+    "pixels' memory": (
+        lambda: gym.make(ENV),
+        {
+            "optimize_memory_usage": True,
+            "replay_buffer_kwargs": {"handle_timeout_termination": False},
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_resumed_run_is_the_undisturbed_one(variant: str, tmp_path: Path) -> None:
+    make_env, changes = VARIANTS[variant]
+    assert differences(make_env, tmp_path, **changes) == []
+
+
+def test_action_noise_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "checkpoints"
+
+    def noisy() -> dict[str, Any]:
+        noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2))
+        calm = str(tmp_path / "calm")
+        return {"policy": "FlowPolicy", **FAST, "action_noise": noise, "tensorboard_log": calm}
+
+    calm = run_to(None, lambda: gym.make(ENV), None, noisy())
+    run_to(47, lambda: gym.make(ENV), path, noisy())
+    resumed = run_to(None, lambda: gym.make(ENV), path, noisy(), resume=True)
+    left, right = _state(calm), _state(resumed)
+    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+
+
+def test_state_dependent_exploration_on_sb3s_own_loop(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="SB3's own loop"):
+        assert differences(lambda: gym.make(ENV), tmp_path, policy=SACPolicy, use_sde=True) == []
+
+
+def test_hindsight_replay(tmp_path: Path) -> None:
+    def goal_env() -> gym.Env:
+        return BitFlippingEnv(n_bits=2, continuous=True, max_steps=5)
+
+    changes = {"policy": "MultiInputFlowPolicy", "replay_buffer_class": HerReplayBuffer}
+    with pytest.warns(UserWarning, match="SB3's own loop"):
+        assert differences(goal_env, tmp_path, **changes) == []
+
+
+def test_callbacks_and_their_environments_go_on(tmp_path: Path) -> None:
+    made: list[EvalCallback] = []
+
+    def evaluate() -> list[BaseCallback]:
+        # Its environment draws from a generator of its own at each reset.
+        env = Monitor(gym.make("Pendulum-v1", max_episode_steps=9))
+        env.reset(seed=5)
+        made.append(EvalCallback(env, eval_freq=25, verbose=0, log_path=str(tmp_path / "eval")))
+        return [made[-1]]
+
+    make_env = lambda: gym.make("Pendulum-v1", max_episode_steps=13)  # noqa: E731
+    assert differences(make_env, tmp_path, evaluate) == []
+    calm, *_, resumed = made
+    assert resumed.evaluations_timesteps == calm.evaluations_timesteps == [25, 50, 75, 100]
+    assert resumed.evaluations_results == calm.evaluations_results
+    assert resumed.n_calls == calm.n_calls == TOTAL
+
+
+def test_monitor_files_are_those_of_the_undisturbed_run(tmp_path: Path) -> None:
+    settings = {"policy": "FlowPolicy", **FAST, "tensorboard_log": str(tmp_path / "calm")}
+
+    def monitored(name: str) -> Callable[[], gym.Env]:
+        return lambda: Monitor(gym.make(ENV), str(tmp_path / name))
+
+    run_to(None, monitored("calm"), None, settings)
+    path = tmp_path / "run" / "checkpoints"
+    run_to(47, monitored("broken"), path, settings)
+    run_to(None, monitored("broken"), path, settings, resume=True)
+    calm, broken = (_rows(tmp_path / f"{name}.monitor.csv") for name in ("calm", "broken"))
+    assert calm == broken
+    assert len(calm) > 10
+    # One header, and its clock goes on.
+    assert (tmp_path / "broken.monitor.csv").read_text().count("t_start") == 1
+
+
+def test_tensorboard_shows_one_run(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    path = tmp_path / "checkpoints"
+    checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": path}
+
+    def new(name: str) -> SACFlow:
+        return SACFlow("FlowPolicy", ENV, **FAST, tensorboard_log=str(tmp_path / name))
+
+    new("calm").learn(110, log_interval=2)
+    with pytest.raises(BrokenError):
+        new("broken").learn(110, log_interval=2, callback=BreakAt(57), **checkpoints)
+    SACFlow.resume(path, ENV).learn(110, log_interval=2, **checkpoints)
+    curves = []
+    for name in ("calm", "broken"):
+        assert [folder.name for folder in (tmp_path / name).iterdir()] == ["SACFlow_1"]
+        events = EventAccumulator(str(tmp_path / name / "SACFlow_1")).Reload()
+        curves.append([(one.step, one.value) for one in events.Scalars("rollout/ep_rew_mean")])
+    assert curves[0] == curves[1]
+    assert len(curves[0]) > 3
+
+
+def test_several_calls_of_learn(tmp_path: Path) -> None:
+    """A program that is run again makes all its calls again: finished ones pass at once."""
+
+    def program(step: int | None, resume: bool) -> SACFlow:
+        path = tmp_path / "checkpoints"
+        model = SACFlow.resume(path, ENV) if resume else SACFlow("FlowPolicy", ENV, **FAST)
+        checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": path}
+        callback = None if step is None else BreakAt(step)
+        model.learn(60, callback=callback, **checkpoints)
+        model.learn(50, callback=callback, reset_num_timesteps=False, **checkpoints)
+        return model
+
+    calm = SACFlow("FlowPolicy", ENV, **FAST).learn(60).learn(50, reset_num_timesteps=False)
+    for step, resume in ((47, False), (93, True)):
+        with pytest.raises(BrokenError):
+            program(step, resume)
+    # Once more when all is done, too.
+    for resumed in (program(None, True), program(None, True)):
+        assert resumed.num_timesteps == 110
+        left, right = _state(calm), _state(resumed)
+        assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+
+
+class Locked(gym.Wrapper):
+    """Holds something that cannot be pickled."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.lock = threading.Lock()
+
+
+def test_environments_that_cannot_be_pickled_begin_a_new_episode(tmp_path: Path) -> None:
+    settings = {**FAST, "learning_starts": 300, "buffer_size": 300}
+
+    def env() -> gym.Env:
+        return Locked(gym.make("Pendulum-v1"))
+
+    model = SACFlow("FlowPolicy", env(), **settings)
+    with pytest.warns(RuntimeWarning, match="cannot be saved .*pickle.*begin a new episode"):
+        model.learn(50, checkpoint_every=50, checkpoint_path=tmp_path)
+    with pytest.warns(RuntimeWarning, match="resuming begins new episodes"):
+        resumed = SACFlow.resume(tmp_path, env())
+    with pytest.warns(RuntimeWarning, match="cannot be saved"):
+        resumed.learn(100, checkpoint_every=50, checkpoint_path=tmp_path)
+    buffer = resumed.replay_buffer
+    assert buffer is not None
+    assert resumed.num_timesteps == buffer.pos == 100
+    # Neither the old episode nor the first one over again.
+    assert not np.array_equal(buffer.observations[50], buffer.next_observations[49])
+    assert not np.array_equal(buffer.observations[50], buffer.observations[0])
+
+
+def test_pybullet_is_not_taken_for_something_that_can_be_saved(tmp_path: Path) -> None:
+    """Its objects can be pickled, but hold handles of a simulation outside of Python."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
+        pytest.importorskip("pybullet_envs_gymnasium")
+    env_id = "InvertedPendulumBulletEnv-v0"
+    settings = {**FAST, "learning_starts": 300, "buffer_size": 300}
+    model = SACFlow("FlowPolicy", VecNormalize(make_vec_env(env_id)), **settings)
+    with pytest.warns(RuntimeWarning, match="cannot be saved .*lives outside of Python"):
+        model.learn(50, checkpoint_every=50, checkpoint_path=tmp_path)
+    with pytest.warns(RuntimeWarning, match="resuming begins new episodes"):
+        resumed = SACFlow.resume(tmp_path, VecNormalize(make_vec_env(env_id)))
+    before, after = model.get_vec_normalize_env(), resumed.get_vec_normalize_env()
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(before.obs_rms.mean, after.obs_rms.mean)  # type: ignore[union-attr]
+    assert resumed.learn(80).num_timesteps == 80
+
+
+def test_without_further_checkpoints_and_by_callback(tmp_path: Path) -> None:
+    calm = SACFlow("FlowPolicy", ENV, **FAST).learn(80)
+    model = SACFlow("FlowPolicy", ENV, **FAST)
+    callback = RunCheckpointCallback(checkpoint_every=20, checkpoint_path=tmp_path)
+    with pytest.raises(BrokenError):
+        model.learn(80, callback=[callback, BreakAt(55)])
+    before = sorted(tmp_path.rglob("*"))
+    resumed = SACFlow.resume(tmp_path, ENV)
+    assert resumed.num_timesteps == 40
+    assert resumed.replay_buffer is not None
+    assert resumed.replay_buffer.size() == 40
+    resumed.learn(80)
+    left, right = _state(calm), _state(resumed)
+    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert sorted(tmp_path.rglob("*")) == before
+    # The same command given again goes on, too, with a model that is new.
+    again = SACFlow("FlowPolicy", ENV, **FAST)
+    callback = RunCheckpointCallback(20, tmp_path, resume=True)
+    again.learn(80, callback=callback)
+    right = _state(again)
+    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert again.ep_info_buffer is not None
+    assert calm.ep_info_buffer is not None
+    assert [one["r"] for one in again.ep_info_buffer] == [one["r"] for one in calm.ep_info_buffer]
+    with pytest.raises(ValueError, match="empty folder for a new run"):
+        SACFlow("FlowPolicy", ENV, **FAST).learn(80, callback=RunCheckpointCallback(20, tmp_path))
+    # A checkpoint's model is an ordinary one.
+    loaded = SACFlow.load(next(tmp_path.glob("*-step-80")) / "model.zip")
+    assert loaded.num_timesteps == 80
