@@ -133,6 +133,8 @@ def check_step(
     if not float(seen.dot(seen)) + float(rewards.dot(rewards)) < _SURELY_FINITE or not ordinary:
         columns = {"observations": observations, "rewards": rewards}
         check_experience(columns, step, ENVIRONMENT)
+    if not any(dones):
+        return
     for index, (done, info) in enumerate(zip(dones, infos, strict=True)):
         if done and info.get("terminal_observation") is not None:
             last = info["terminal_observation"]

@@ -21,7 +21,7 @@ from sb3_flowpolicy import sac_flow, seed_batch
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 from sb3_flowpolicy.benchmarks.updates import Unmoved
 from sb3_flowpolicy.benchmarks.zoo_blocks import zoo_block
-from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.guard import UPDATES_BETWEEN_LOOKS, TrainingGuard
 from sb3_flowpolicy.policies import DistributionPolicy
 from sb3_flowpolicy.policies.deterministic import MODES
 from sb3_flowpolicy.sac_flow import SACFlow
@@ -139,11 +139,13 @@ def main() -> None:
         print(f"{kind}: {step * 1e6:.0f} us of CPU time per step, compiled")
         total = 0.0
         for name, times in _time_calls(turns).items():
-            share = statistics.median(times) * len(times) / turns.chunk / step
+            # A chunk begins and ends with a look; a long run has one now and then.
+            often = 1 / UPDATES_BETWEEN_LOOKS if name == "look" else len(times) / turns.chunk
+            share = statistics.median(times) * often / step
             total += share
             print(
                 f"  {name:16} median {statistics.median(times) * 1e6:7.1f} us, "
-                f"{len(times) / turns.chunk:.3f} per step: {share:.2%}"
+                f"{often:.4f} per step: {share:.2%}"
             )
         print(f"  together {total:.2%}", flush=True)
 
@@ -169,6 +171,7 @@ def _time_calls(turns: _Turns) -> dict[str, list[float]]:
         timed(seed_batch, "check_experience"),
         timed(TrainingGuard, "before_updates"),
         timed(TrainingGuard, "after_updates"),
+        timed(TrainingGuard, "look"),
     ):
         turns.watched()
     return found
