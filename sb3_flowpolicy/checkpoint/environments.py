@@ -22,8 +22,8 @@ def layers(env: Any) -> dict[str, Any]:
 
     Example:
         >>> import gymnasium as gym
-        >>> list(layers(gym.make("Pendulum-v1")))[:2]
-        ['0:TimeLimit', '0.0:OrderEnforcing']
+        >>> list(layers(gym.make("Pendulum-v1").unwrapped))
+        ['0:PendulumEnv']
     """
     found: dict[str, Any] = {}
     waiting = [("0", env)]
