@@ -41,6 +41,7 @@ SETTINGS: dict[str, Any] = {
     "gradient_steps": 8,
     "learning_starts": 1000,
     "policy_kwargs": {"net_arch": [400, 300]},
+    "compile": True,
 }
 STEPS_BETWEEN_LOOKS = 1000
 COLUMNS = ("seed", "step", "updates", "episodes", "train_return", "max_parameter", "ent_coef")
@@ -61,7 +62,7 @@ def train(algo: str, seeds: Sequence[int], steps: int, path: Path | None) -> boo
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
         import_module("pybullet_envs_gymnasium")
-    batch = SeedBatch(POLICIES[algo], ENV_ID, seeds, compile=True, device="cpu", **SETTINGS)
+    batch = SeedBatch(POLICIES[algo], ENV_ID, seeds, device="cpu", **SETTINGS)
     rows: list[list[object]] = []
     done = 0
     while done < steps:
