@@ -340,6 +340,7 @@ class SACFlow(Resumable, Shareable, SAC):
         super().save(path, exclude, include)
 
     def _extra_state(self) -> dict[str, Any]:
+        self._guard.look()  # no checkpoint is spoiled
         # Whoever acts with an engine draws other numbers than whoever acts without.
         return {"engine": self._engine is not None}
 

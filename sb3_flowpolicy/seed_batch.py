@@ -271,6 +271,7 @@ class SeedBatch(BatchOnDisk):
             self._engine = Engine(models, first.critic_loss_coef, compiled, first.autocast)
         self._engine.synchronize()
         self._guard.restart()
+        self._guard.resume_from = None if self._checkpoints is None else self._checkpoints.path
         buffers = self._buffers()
         # An agent that was trained on its own has its buffer's arrays to itself since then.
         if not self._storage.rows.holds(buffers):

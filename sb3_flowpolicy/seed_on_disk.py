@@ -20,6 +20,7 @@ from sb3_flowpolicy.checkpoint.session import (
 )
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
+from sb3_flowpolicy.guard import TrainingGuard
 from sb3_flowpolicy.sac_flow import SACFlow
 from sb3_flowpolicy.seed_checkpoint import read_batch, write_batch
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
@@ -39,6 +40,7 @@ class BatchOnDisk:
     _venv: VectorEnv
     _obs: np.ndarray | None
     _losses: list[list[float]] | None
+    _guard: TrainingGuard
     _checkpoints: Checkpoints | None = None
     _resumption: Resumption | None = None
 
@@ -153,6 +155,7 @@ class BatchOnDisk:
         return storage, Ring(storage.rows.columns, storage.pos, storage.full)
 
     def _extra_state(self) -> dict[str, Any]:
+        self._guard.look()  # no checkpoint is spoiled
         return {
             "noise": {name: one.state() for name, one in self._noise.items()},
             "episodes": self._episodes.state(),

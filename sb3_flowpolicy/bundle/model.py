@@ -89,13 +89,13 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
         name: optimizer_to_spec(f"optimizer.{name}", optimizer, arrays)
         for name, optimizer in _optimizers(model).items()
     }
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ValueError(f"model must be finite to be worth sharing, got NaN or inf in {name}")
     policy_name, policy = policy_class_name(model.policy_class), model.policy
     assert isinstance(policy, DistributionPolicy)
     known = normalization_of(model, vec_normalize)
     spec = None if known is None else normalization_to_spec("normalization", known, arrays)
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"model must be finite to be worth sharing, got NaN or inf in {name}")
     config = {
         "format": FORMAT,
         "made_with": _made_with(),

@@ -23,18 +23,31 @@ def layers(env: Any) -> dict[str, Any]:
     Example:
         >>> import gymnasium as gym
         >>> list(layers(gym.make("Pendulum-v1").unwrapped))
-        ['0:PendulumEnv']
+        ['0:PendulumEnv(Pendulum-v1)']
     """
     found: dict[str, Any] = {}
     waiting = [("0", env)]
     while waiting:
         place, layer = waiting.pop(0)
-        found[f"{place}:{type(layer).__name__}"] = layer
+        found[f"{place}:{type(layer).__name__}{_origin(layer)}"] = layer
         attributes = vars(layer)
         inside = [attributes[name] for name in ("venv", "env") if name in attributes]
         inside += attributes.get("envs", [])
         waiting += [(f"{place}.{index}", part) for index, part in enumerate(inside)]
     return found
+
+
+def _origin(layer: Any) -> str:
+    """Say how gymnasium made an innermost environment: another width is another environment."""
+    spec = vars(layer).get("spec")
+    if spec is None or "env" in vars(layer):
+        return ""
+    plain = {
+        key: value
+        for key, value in sorted(getattr(spec, "kwargs", {}).items())
+        if key != "render_mode" and isinstance(value, bool | int | float | str | list | tuple)
+    }
+    return f"({', '.join([spec.id, *(f'{key}={value}' for key, value in plain.items())])})"
 
 
 def layer_states(env: Any, outside_only: bool = False) -> LayerStates:

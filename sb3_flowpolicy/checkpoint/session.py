@@ -74,6 +74,11 @@ class Checkpoints:
         """
         self.run.callbacks = dict(callbacks)
         now, stop = self.run.first.num_timesteps, self.signals.received is not None
+        if self._last is not None and now < self._last:
+            raise ValueError(
+                "reset_num_timesteps must be False for a second run in the same checkpoint_path, "
+                f"got a count of {now} where {self.path} is at {self._last}"
+            )
         if stop or self._last is None or now // self.every > self._last // self.every:
             self.write()
         return not stop
@@ -114,7 +119,8 @@ class Checkpoints:
         source, ring = found
         steps = run.first.num_timesteps // run.first.n_envs
         files = self._rows.update(source, ring, steps, new_rows)
-        return {"segments": segments.to_json(files), "pos": ring.pos, "full": ring.full}
+        facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
+        return {"segments": segments.to_json(files), **facts}
 
 
 @dataclass
@@ -176,6 +182,8 @@ def start_checkpoints(owner: Resumes, path: str | Path | None, every: int | None
     if owner._checkpoints is None or owner._checkpoints.path.resolve() != Path(path).resolve():
         check_every(every)
         owner._checkpoints = Checkpoints(owner._describe_run(), path, owner._resumption)
+    else:
+        owner._checkpoints.run = owner._describe_run()  # the environment may be another by now
     owner._checkpoints.start(every)
 
 
@@ -261,6 +269,11 @@ def take_up(run: Run, store: CheckpointStore, checkpoint: Checkpoint) -> Resumpt
             agent.load_replay_buffer(path, truncate_last_traj=False)
     else:
         source, ring = found
+        if manifest["capacity"] != ring.capacity:
+            raise ValueError(
+                f"buffer_size must be as when the checkpoint was written, {manifest['capacity']} "
+                f"steps of each environment, got {ring.capacity}"
+            )
         files = segments.from_json(manifest["segments"])
         segments.fill(ring.columns, checkpoint.rows_folder, files)
         source.pos, source.full = manifest["pos"], manifest["full"]
@@ -270,8 +283,9 @@ def take_up(run: Run, store: CheckpointStore, checkpoint: Checkpoint) -> Resumpt
 
 def check_every(checkpoint_every: int) -> int:
     """Return ``checkpoint_every``, or raise ``ValueError`` if it is below 1."""
-    if checkpoint_every < 1:
-        raise ValueError(f"checkpoint_every must be at least 1, got {checkpoint_every}")
+    whole = isinstance(checkpoint_every, int) and not isinstance(checkpoint_every, bool)
+    if not whole or checkpoint_every < 1:
+        raise ValueError(f"checkpoint_every must be at least 1, got {checkpoint_every!r}")
     return checkpoint_every
 
 

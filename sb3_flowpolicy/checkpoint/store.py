@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterable
@@ -16,6 +17,7 @@ FORMAT = 1
 """Version of what is on disk; raised when older versions of this package could not read it."""
 
 KEPT = 2
+_NAME = re.compile(r"\d+-step-\d+")
 _MANIFEST = "manifest.json"
 _ROWS = "replay"
 _PARTIAL = ".partial"
@@ -56,7 +58,8 @@ class CheckpointStore:
 
     def folders(self) -> list[Path]:
         """Return the folders of checkpoints, oldest first, be they damaged or not."""
-        return sorted(self.path.glob("[0-9]*-step-*"), key=_number)
+        found = self.path.glob("[0-9]*-step-*")
+        return sorted((one for one in found if _NAME.fullmatch(one.name)), key=_number)
 
     def newest(self) -> Checkpoint:
         """Return the newest checkpoint that is undamaged.

@@ -14,7 +14,7 @@ import pytest
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow, SeedBatch
-from sb3_flowpolicy.checkpoint import has_checkpoint
+from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
 from sb3_flowpolicy.checkpoint.store import FORMAT, CheckpointStore, _seal
 
 ENV = "TunnelDiagonal-v0"
@@ -140,16 +140,50 @@ def test_the_wrong_thing_is_refused(run: Path) -> None:
         SeedBatch.resume(run, ENV)
     with pytest.raises(ValueError, match=r"env must be built and wrapped .* got .*PendulumEnv"):
         SACFlow.resume(run, "Pendulum-v1")
-    with pytest.raises(ValueError, match=r"env must be that of .*Observation spaces do not match"):
+    with pytest.raises(ValueError, match=r"env must be built and wrapped .* got .*total_dims=3"):
         SACFlow.resume(run, gym.make(ENV, total_dims=3, free_dims=1))
     model = SACFlow("FlowPolicy", ENV, **FAST)
     with pytest.raises(ValueError, match=r"an empty folder for a new run, got .*-step-80"):
         model.learn(10, checkpoint_every=5, checkpoint_path=run)
 
 
+def test_a_tunnel_of_another_width_is_another_environment(run: Path) -> None:
+    with pytest.raises(ValueError, match=r"env must be built and wrapped .* got .*width=0\.5"):
+        SACFlow.resume(run, gym.make(ENV, width=0.5))
+
+
+def test_a_replay_buffer_of_another_size_is_refused(run: Path) -> None:
+    model = SACFlow("FlowPolicy", ENV, **{**FAST, "buffer_size": 70})
+    with pytest.raises(ValueError, match=r"buffer_size must be .* 60 steps .*, got 70"):
+        model.learn(120, callback=RunCheckpointCallback(40, run, resume=True))
+
+
+def test_a_second_run_in_the_folder_goes_on_counting(tmp_path: Path) -> None:
+    model = SACFlow("FlowPolicy", ENV, **FAST)
+    model.learn(20, checkpoint_every=10, checkpoint_path=tmp_path)
+    model.set_env(gym.make(ENV, width=0.5))
+    model.learn(10, checkpoint_every=10, checkpoint_path=tmp_path, reset_num_timesteps=False)
+    assert steps(tmp_path) == [20, 30]
+    assert SACFlow.resume(tmp_path, gym.make(ENV, width=0.5)).num_timesteps == 30
+    with pytest.raises(ValueError, match=r"reset_num_timesteps must be False .* got a count of 0"):
+        model.learn(10, checkpoint_every=10, checkpoint_path=tmp_path)
+    assert steps(tmp_path) == [20, 30]
+
+
+def test_folders_of_others_do_not_count(run: Path) -> None:
+    (run / "9-step-tone").mkdir()
+    assert steps(run) == [40, 80]
+    assert SACFlow.resume(run, ENV).num_timesteps == 80
+
+
+@pytest.mark.parametrize("every", [0, 2.5, "10", True])
+def test_an_interval_is_a_positive_whole_number(every: Any, tmp_path: Path) -> None:
+    model = SACFlow("FlowPolicy", ENV, **FAST)
+    with pytest.raises(ValueError, match=f"checkpoint_every must be at least 1, got {every!r}"):
+        model.learn(10, checkpoint_every=every, checkpoint_path=tmp_path)
+
+
 def test_arguments_are_checked(tmp_path: Path) -> None:
     model = SACFlow("FlowPolicy", ENV, **FAST)
-    with pytest.raises(ValueError, match="checkpoint_every must be at least 1, got 0"):
-        model.learn(10, checkpoint_every=0, checkpoint_path=tmp_path)
     with pytest.raises(ValueError, match="go together, got 10 and None"):
         model.learn(10, checkpoint_every=10)
