@@ -25,6 +25,14 @@ if TYPE_CHECKING:
         MultiInputGaussPolicy,
         MultiInputLowRankPolicy,
     )
+    from sb3_flowpolicy.policies.on_policy import (
+        CnnFlowActorCriticPolicy,
+        CnnLowRankActorCriticPolicy,
+        FlowActorCriticPolicy,
+        LowRankActorCriticPolicy,
+        MultiInputFlowActorCriticPolicy,
+        MultiInputLowRankActorCriticPolicy,
+    )
     from sb3_flowpolicy.sac_flow import SACFlow
     from sb3_flowpolicy.seed_batch import SeedBatch
 
@@ -33,14 +41,20 @@ __version__ = "0.1.0"
 __all__ = [
     "ActionDistribution",
     "BundleError",
+    "CnnFlowActorCriticPolicy",
     "CnnFlowPolicy",
     "CnnGaussPolicy",
+    "CnnLowRankActorCriticPolicy",
     "CnnLowRankPolicy",
+    "FlowActorCriticPolicy",
     "FlowPolicy",
     "GaussPolicy",
+    "LowRankActorCriticPolicy",
     "LowRankPolicy",
+    "MultiInputFlowActorCriticPolicy",
     "MultiInputFlowPolicy",
     "MultiInputGaussPolicy",
+    "MultiInputLowRankActorCriticPolicy",
     "MultiInputLowRankPolicy",
     "NonFiniteError",
     "RunCheckpointCallback",
@@ -54,6 +68,12 @@ __all__ = [
 _ELSEWHERE = {
     "ActionDistribution": "distributions",
     "BundleError": "bundle",
+    "CnnFlowActorCriticPolicy": "policies.on_policy",
+    "CnnLowRankActorCriticPolicy": "policies.on_policy",
+    "FlowActorCriticPolicy": "policies.on_policy",
+    "LowRankActorCriticPolicy": "policies.on_policy",
+    "MultiInputFlowActorCriticPolicy": "policies.on_policy",
+    "MultiInputLowRankActorCriticPolicy": "policies.on_policy",
     "NonFiniteError": "finite",
     "RunCheckpointCallback": "checkpoint",
     "SACFlow": "sac_flow",

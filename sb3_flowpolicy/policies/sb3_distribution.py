@@ -7,6 +7,9 @@ from stable_baselines3.common.distributions import Distribution
 
 from sb3_flowpolicy.distributions import ActionDistribution
 
+# PPO asks for the entropy of whole minibatches, over which the estimate's noise averages out.
+ENTROPY_PAIRS = 2
+
 
 class ActionDistributionAdapter(Distribution):
     """An :class:`ActionDistribution` as an SB3 ``Distribution``; its one parameter is the context.
@@ -41,9 +44,16 @@ class ActionDistributionAdapter(Distribution):
         """Score ``actions`` (batch, D): shape (batch,)."""
         return self.density.log_prob(self._conditioned(), actions)
 
-    def entropy(self) -> th.Tensor | None:
-        """Return None: no closed form, as with SB3's squashed normal distribution."""
-        return None
+    def entropy(self) -> th.Tensor:
+        """Estimate the entropy by Monte Carlo, with gradient: shape (batch,).
+
+        There is no closed form for squashed or bent densities. Noise comes in pairs of opposite
+        sign, so that what is odd in it cancels.
+        """
+        context = self._conditioned()
+        noise = self._draw_noise(ENTROPY_PAIRS)
+        noise = th.cat([noise, -noise])
+        return -self.density.rsample_and_log_prob(context, noise)[1].mean(0)
 
     def sample(self) -> th.Tensor:
         """Draw a reparametrised sample, shape (batch, D)."""
@@ -62,10 +72,12 @@ class ActionDistributionAdapter(Distribution):
         return self.proba_distribution(context)._sample_and_log_prob()
 
     def _sample_and_log_prob(self) -> tuple[th.Tensor, th.Tensor]:
+        return self.density.rsample_and_log_prob(self._conditioned(), self._draw_noise())
+
+    def _draw_noise(self, *sample_shape: int) -> th.Tensor:
         context = self._conditioned()
-        shape = (*context.shape[:-1], self.density.noise_dim)
-        noise = th.randn(shape, dtype=context.dtype, device=context.device)
-        return self.density.rsample_and_log_prob(context, noise)
+        shape = (*sample_shape, *context.shape[:-1], self.density.noise_dim)
+        return th.randn(shape, dtype=context.dtype, device=context.device)
 
     def _conditioned(self) -> th.Tensor:
         if self.context is None:

@@ -1,0 +1,179 @@
+"""Policy classes for PPO and A2C: SB3's, with a registered density."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
+
+# Of SB3's normal distributions, which are not built.
+_NOT_OURS = {"use_sde", "log_std_init", "full_std", "use_expln", "squash_output"}
+
+
+class DensityActorCritic(ActorCriticPolicy):
+    """Actor-critic policy with a registered density as its action distribution.
+
+    The log-probability of an action is that of the very numbers in the rollout buffer, by the
+    density's inverse, while collecting and while learning. So the ratio of PPO is exactly 1
+    before the first update, however far an action is saturated. The entropy bonus is a Monte
+    Carlo estimate whose gradient reaches all parameters of the density.
+
+    Args:
+        observation_space: Observation space.
+        action_space: Box of any shape; with finite bounds if ``squash_output``.
+        lr_schedule: Learning rate schedule.
+        distribution: Name of a registered density. Default: the policy class's own.
+        distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
+        squash_output: Whether tanh bounds actions, in which case they are rescaled to the action
+            space. Otherwise they are clipped to it, as SB3 does by default.
+        **policy_kwargs: Everything else that SB3's ``ActorCriticPolicy`` takes: ``net_arch``,
+            ``activation_fn``, ``ortho_init``, ``features_extractor_class``, ...
+
+    Raises:
+        ValueError: If the action space is no Box (with finite bounds), the density or an argument
+            is unknown, or ``use_sde=True``.
+
+    References:
+        Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5 on
+        on-policy algorithms as the next to be given these densities.
+    """
+
+    default_distribution: ClassVar[str]
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        *,
+        distribution: str | None = None,
+        distribution_kwargs: Mapping[str, Any] | None = None,
+        squash_output: bool = True,
+        use_sde: bool = False,
+        **policy_kwargs: Any,
+    ) -> None:
+        if not isinstance(action_space, spaces.Box):
+            raise ValueError(f"action_space must be a Box, got {action_space}")
+        if squash_output and not np.isfinite([action_space.low, action_space.high]).all():
+            raise ValueError(
+                "action_space must have finite bounds for actions to be squashed into, got "
+                f"{action_space}: pass squash_output=False"
+            )
+        if use_sde:
+            raise ValueError("use_sde must be False: gSDE is a density of its own, got True")
+        if not isinstance(distribution_kwargs, Mapping | None):
+            raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
+        known = {name for base in type(self).__mro__ for name in _parameters(base)} - _NOT_OURS
+        unknown = sorted(set(policy_kwargs) - known)
+        if unknown:
+            raise ValueError(
+                "policy_kwargs must be ActorCriticPolicy's (but for its normal distribution's), "
+                f"distribution, distribution_kwargs or squash_output, got {unknown}"
+            )
+        # Plain attributes before super().__init__(), which builds the networks.
+        self.distribution = self.default_distribution if distribution is None else distribution
+        self.distribution_kwargs = dict(distribution_kwargs or {})
+        self._squashes = squash_output
+        super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
+        # SB3's constructor allows it to gSDE only, though all of SB3 that reads it is ready for us.
+        self._squash_output = squash_output
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        # The normal heads were initialised with all the rest, and now give way.
+        del self.log_std
+        size, features = spaces.flatdim(self.action_space), self.mlp_extractor.latent_dim_pi
+        density = make_distribution(self.distribution, size, features, **self.distribution_kwargs)
+        density = TanhSquashed(density) if self._squashes else density
+        self.action_net: nn.Module = density.to(self.device)
+        self.action_dist = ActionDistributionAdapter(density)  # type: ignore[assignment]
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
+        return self.action_dist.proba_distribution(latent_pi)  # type: ignore[call-arg]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data = {name: value for name, value in data.items() if name not in _NOT_OURS}
+        data.update(
+            distribution=self.distribution,
+            distribution_kwargs=self.distribution_kwargs,
+            squash_output=self._squashes,
+            # Missing in SB3's: a policy that shares its extractor would load as one that does not.
+            share_features_extractor=self.share_features_extractor,
+        )
+        return data
+
+
+def _parameters(policy_class: type) -> set[str]:
+    return set(inspect.signature(policy_class.__init__).parameters)
+
+
+class FlowActorCriticPolicy(DensityActorCritic):
+    """Conditional RealNVP for PPO and A2C; the distribution correlates and bends.
+
+    Example:
+        >>> from stable_baselines3 import PPO
+        >>> model = PPO(FlowActorCriticPolicy, "Pendulum-v1", n_steps=64).learn(64)
+        >>> obs = model.get_env().reset()
+        >>> model.predict(obs, deterministic=True)[0].shape
+        (1, 1)
+    """
+
+    default_distribution = "realnvp"
+
+
+class LowRankActorCriticPolicy(DensityActorCritic):
+    """Normal distribution with low-rank covariance for PPO and A2C; actions correlate.
+
+    Example:
+        >>> from stable_baselines3 import A2C
+        >>> kwargs = dict(distribution_kwargs=dict(rank=1), squash_output=False)
+        >>> model = A2C(LowRankActorCriticPolicy, "Pendulum-v1", policy_kwargs=kwargs)
+    """
+
+    default_distribution = "low_rank"
+
+
+class _ForImages(DensityActorCritic):
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("features_extractor_class", NatureCNN)
+        super().__init__(*args, **kwargs)
+
+
+class _ForDicts(DensityActorCritic):
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("features_extractor_class", CombinedExtractor)
+        super().__init__(*args, **kwargs)
+
+
+class CnnFlowActorCriticPolicy(_ForImages, FlowActorCriticPolicy):
+    """:class:`FlowActorCriticPolicy` for image observations."""
+
+
+class CnnLowRankActorCriticPolicy(_ForImages, LowRankActorCriticPolicy):
+    """:class:`LowRankActorCriticPolicy` for image observations."""
+
+
+class MultiInputFlowActorCriticPolicy(_ForDicts, FlowActorCriticPolicy):
+    """:class:`FlowActorCriticPolicy` for dictionary observations."""
+
+
+class MultiInputLowRankActorCriticPolicy(_ForDicts, LowRankActorCriticPolicy):
+    """:class:`LowRankActorCriticPolicy` for dictionary observations."""

@@ -1,0 +1,260 @@
+"""PPO and A2C with our densities: exact ratios, everything SB3 does with a policy."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_flowpolicy import (
+    CnnFlowActorCriticPolicy,
+    CnnLowRankActorCriticPolicy,
+    FlowActorCriticPolicy,
+    LowRankActorCriticPolicy,
+    MultiInputFlowActorCriticPolicy,
+    MultiInputLowRankActorCriticPolicy,
+)
+from sb3_flowpolicy.policies.recurrent import FlowLstmPolicy
+
+POLICIES = [FlowActorCriticPolicy, LowRankActorCriticPolicy]
+BOTH = pytest.mark.parametrize("policy", POLICIES)
+SQUASHED_OR_NOT = pytest.mark.parametrize("squash_output", [True, False])
+
+
+class Box2D(gym.Env[np.ndarray, np.ndarray]):
+    """Three numbers to look at, a 2 x 2 action with uneven bounds, ten steps."""
+
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Box(np.full((2, 2), -3.0, np.float32), np.float32([[1, 2], [3, 4]]))
+
+    def reset(
+        self, *, seed: int | None = None, options: Any = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), action
+        self.steps += 1
+        return self.observation_space.sample(), float(action.sum()), False, self.steps == 10, {}
+
+
+def disturbed(model: PPO | A2C, scale: float = 0.3) -> PPO | A2C:
+    """Move the weights off their initial values, where flows are the identity."""
+    with th.no_grad():
+        for parameter in model.policy.action_net.parameters():
+            parameter.add_(scale * th.randn_like(parameter))
+    return model
+
+
+@BOTH
+@SQUASHED_OR_NOT
+@pytest.mark.parametrize("scale", [0.0, 0.3])
+def test_stored_actions_have_the_log_prob_they_were_collected_with(
+    policy: type[ActorCriticPolicy], squash_output: bool, scale: float
+) -> None:
+    model = PPO(
+        policy,
+        Box2D(),
+        n_steps=256,
+        batch_size=256,
+        seed=0,
+        policy_kwargs={"squash_output": squash_output},
+    )
+    disturbed(model, scale)
+    found: list[float] = []
+    model.train = lambda: found.append(_largest_difference(model))  # type: ignore[method-assign]
+    model.learn(256)
+    assert found
+    assert found[0] < 1e-5
+
+
+def _largest_difference(model: PPO) -> float:
+    (data,) = model.rollout_buffer.get(256)
+    with th.no_grad():
+        _, log_prob, _ = model.policy.evaluate_actions(data.observations, data.actions)
+    scale = data.old_log_prob.abs().clamp_min(1)
+    return ((log_prob - data.old_log_prob).abs() / scale).max().item()
+
+
+@BOTH
+def test_kl_and_clip_fraction_are_those_of_a_recomputation_in_float64(
+    policy: type[ActorCriticPolicy],
+) -> None:
+    model = PPO(policy, Box2D(), n_steps=128, batch_size=128, n_epochs=1, seed=0)
+    disturbed(model)
+    model.learn(128)
+    data = next(model.rollout_buffer.get(128))
+    with th.no_grad():  # after this step the policy differs from the one that collected
+        for parameter in model.policy.action_net.parameters():
+            parameter.add_(0.1 * th.randn_like(parameter))
+        _, new, _ = model.policy.evaluate_actions(data.observations, data.actions)
+        model.policy.double()
+        context = model.policy.mlp_extractor.forward_actor(data.observations.double())
+        # An action on the very edge is scored as float32's last number before it.
+        edge = 1 - th.finfo(th.float32).eps
+        actions = data.actions.double().clamp(-edge, edge)
+        new64 = model.policy.action_net.log_prob(context, actions)
+    ratio, ratio64 = ((now.double() - data.old_log_prob.double()).exp() for now in (new, new64))
+    kl, kl64 = ((r - 1 - r.log()).mean().item() for r in (ratio, ratio64))
+    clipped, clipped64 = (((r - 1).abs() > 0.2).double().mean().item() for r in (ratio, ratio64))
+    assert kl64 > 1e-3
+    assert kl == pytest.approx(kl64, rel=1e-3)
+    assert 0 < clipped64 < 1
+    assert clipped == pytest.approx(clipped64, abs=1 / 128)
+
+
+@BOTH
+@SQUASHED_OR_NOT
+def test_the_entropy_bonus_is_the_entropy_and_moves_it(
+    policy: type[ActorCriticPolicy], squash_output: bool
+) -> None:
+    kwargs = {"squash_output": squash_output}
+    model = PPO(policy, Box2D(), seed=0, policy_kwargs=kwargs, learning_rate=1e-2)
+    disturbed(model, 0.1)
+    obs = th.randn(64, 3)
+    dist = model.policy.get_distribution(obs)
+    action = th.stack([dist.sample() for _ in range(500)])
+    expected = -th.stack([dist.log_prob(one) for one in action]).mean(0)
+    with th.no_grad():
+        estimates = th.stack([dist.entropy() for _ in range(100)])
+    error = estimates.std(0) / 100**0.5 + expected.std() / 500**0.5
+    assert ((estimates.mean(0) - expected).abs() < 6 * error + 0.02).all()
+
+    before = estimates.mean()
+    for _ in range(20):  # what an entropy bonus alone would do
+        loss = model.policy.get_distribution(obs).entropy().mean()
+        model.policy.optimizer.zero_grad()
+        loss.backward()
+        model.policy.optimizer.step()
+    with th.no_grad():
+        assert model.policy.get_distribution(obs).entropy().mean() < before - 0.1
+
+
+@BOTH
+@SQUASHED_OR_NOT
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_a_saved_model_predicts_the_same(
+    policy: type[ActorCriticPolicy], squash_output: bool, algorithm: Any, tmp_path: Path
+) -> None:
+    kwargs = {"squash_output": squash_output, "net_arch": [16]}
+    model = algorithm(policy, Box2D(), n_steps=32, policy_kwargs=kwargs, seed=1).learn(64)
+    obs = np.random.default_rng(0).uniform(-1, 1, (5, 3)).astype(np.float32)
+    expected = model.predict(obs, deterministic=True)[0]
+    assert expected.shape == (5, 2, 2)
+    assert (expected >= Box2D.action_space.low).all()
+    assert (expected <= Box2D.action_space.high).all()
+    loaded = algorithm.load(_saved(model, tmp_path))
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(_sampled(loaded, obs), _sampled(model, obs))
+    model.policy.save(tmp_path / "policy")
+    alone = type(model.policy).load(tmp_path / "policy")
+    np.testing.assert_array_equal(alone.predict(obs, deterministic=True)[0], expected)
+
+
+def _saved(model: PPO | A2C, folder: Path) -> Path:
+    model.save(folder / "model")
+    return folder / "model.zip"
+
+
+def _sampled(model: PPO | A2C, obs: np.ndarray) -> np.ndarray:
+    th.manual_seed(3)
+    return model.predict(obs)[0]
+
+
+def test_a_saved_model_loads_in_a_new_process(tmp_path: Path) -> None:
+    model = PPO(FlowActorCriticPolicy, "Pendulum-v1", n_steps=32, batch_size=32, seed=0).learn(32)
+    expected = model.predict(np.zeros(3, np.float32), deterministic=True)[0].item()
+    code = (
+        "import sys, numpy as np\n"
+        "from stable_baselines3 import PPO\n"
+        "model = PPO.load(sys.argv[1])\n"
+        "print(repr(model.predict(np.zeros(3, np.float32), deterministic=True)[0].item()))\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(_saved(model, tmp_path))],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert float(run.stdout) == expected
+
+
+@pytest.mark.parametrize(
+    ("policy", "env"),
+    [
+        (CnnFlowActorCriticPolicy, lambda: FakeImageEnv(40, 40, discrete=False)),
+        (CnnLowRankActorCriticPolicy, lambda: FakeImageEnv(40, 40, discrete=False)),
+        (MultiInputFlowActorCriticPolicy, lambda: SimpleMultiObsEnv(discrete_actions=False)),
+        (MultiInputLowRankActorCriticPolicy, lambda: SimpleMultiObsEnv(discrete_actions=False)),
+    ],
+)
+def test_images_and_dictionaries(policy: type[ActorCriticPolicy], env: Any, tmp_path: Path) -> None:
+    model = PPO(policy, env(), n_steps=16, batch_size=16, n_epochs=1, seed=0).learn(16)
+    env = model.get_env()
+    assert env is not None
+    obs = env.reset()
+    expected = model.predict(obs, deterministic=True)[0]
+    loaded = PPO.load(_saved(model, tmp_path))
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], expected)
+
+
+def test_recurrent_ppo(tmp_path: Path) -> None:
+    kwargs = {"lstm_hidden_size": 8, "net_arch": [8]}
+    model = RecurrentPPO(FlowLstmPolicy, Box2D(), n_steps=32, policy_kwargs=kwargs, seed=0)
+    model.learn(64)
+    model.save(tmp_path / "model")
+    loaded = RecurrentPPO.load(tmp_path / "model")
+    obs = np.zeros((1, 3), np.float32)
+    expected, memory = model.predict(obs, deterministic=True)
+    found, same_memory = loaded.predict(obs, deterministic=True)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(same_memory, memory)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"distribution": "nvp"}, "distribution must be one of"),
+        ({"distribution_kwargs": {"layer": 2}}, 'distribution_kwargs of "realnvp" must be among'),
+        ({"distribution_kwargs": 4}, "distribution_kwargs must be a dict, got 4"),
+        ({"log_std_init": -1.0}, r"policy_kwargs must be ActorCriticPolicy's .* got \['log_std"),
+        ({"layers": 2}, r"policy_kwargs must be ActorCriticPolicy's .* got \['layers'\]"),
+    ],
+)
+def test_bad_arguments(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PPO(FlowActorCriticPolicy, Box2D(), policy_kwargs=kwargs)
+
+
+def test_bad_spaces_and_gsde() -> None:
+    with pytest.raises(ValueError, match=r"action_space must be a Box, got Discrete\(2\)"):
+        PPO(FlowActorCriticPolicy, "CartPole-v1")
+    with pytest.raises(ValueError, match="use_sde must be False"):
+        PPO(FlowActorCriticPolicy, "Pendulum-v1", use_sde=True)
+    space, schedule = spaces.Box(-np.inf, np.inf, (2,)), lambda _: 1e-3
+    with pytest.raises(ValueError, match="action_space must have finite bounds"):
+        FlowActorCriticPolicy(Box2D.observation_space, space, schedule)
+    policy = FlowActorCriticPolicy(Box2D.observation_space, space, schedule, squash_output=False)
+    assert policy.predict(np.zeros(3, np.float32))[0].shape == (2,)
+
+
+@BOTH
+def test_it_learns(policy: type[ActorCriticPolicy]) -> None:
+    """Reward is the sum of actions: the best is the upper corner."""
+    model = PPO(policy, Box2D(), n_steps=256, batch_size=128, learning_rate=1e-2, seed=0)
+    model.learn(1536)
+    action = model.predict(np.zeros((1, 3), np.float32), deterministic=True)[0]
+    assert action.sum() > 3  # the best is 10, the middle of the box -1
