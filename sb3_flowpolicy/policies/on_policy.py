@@ -75,7 +75,8 @@ class DensityActorCritic(ActorCriticPolicy):
             raise ValueError("use_sde must be False: gSDE is a density of its own, got True")
         if not isinstance(distribution_kwargs, Mapping | None):
             raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
-        known = {name for base in type(self).__mro__ for name in _parameters(base)} - _NOT_OURS
+        bases = [base for base in type(self).__mro__ if issubclass(base, ActorCriticPolicy)]
+        known = {name for base in bases for name in inspect.signature(base).parameters} - _NOT_OURS
         unknown = sorted(set(policy_kwargs) - known)
         if unknown:
             raise ValueError(
@@ -98,15 +99,12 @@ class DensityActorCritic(ActorCriticPolicy):
         density = make_distribution(self.distribution, size, features, **self.distribution_kwargs)
         density = TanhSquashed(density) if self._squashes else density
         self.action_net: nn.Module = density.to(self.device)
-        self.action_dist = ActionDistributionAdapter(density)  # type: ignore[assignment]
-        self.optimizer = self.optimizer_class(
-            self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.action_dist = ActionDistributionAdapter(density)
+        parameters, rate = self.parameters(), lr_schedule(1)
+        self.optimizer = self.optimizer_class(parameters, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
-        return self.action_dist.proba_distribution(latent_pi)  # type: ignore[call-arg]
+        return self.action_dist.proba_distribution(latent_pi)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -119,10 +117,6 @@ class DensityActorCritic(ActorCriticPolicy):
             share_features_extractor=self.share_features_extractor,
         )
         return data
-
-
-def _parameters(policy_class: type) -> set[str]:
-    return set(inspect.signature(policy_class.__init__).parameters)
 
 
 class FlowActorCriticPolicy(DensityActorCritic):
