@@ -30,7 +30,7 @@ from sb3_flowpolicy.demonstrations import (
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
 from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
 from sb3_flowpolicy.guard import TrainingGuard
-from sb3_flowpolicy.policies.sac import DistributionPolicy, check_finite_actions
+from sb3_flowpolicy.policies.off_policy import DistributionPolicy, check_finite_actions
 from sb3_flowpolicy.settings import check_settings
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.

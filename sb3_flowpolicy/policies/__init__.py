@@ -1,11 +1,11 @@
 """Actors and SB3 policy classes: where SB3's words become those of the densities."""
 
 from sb3_flowpolicy.policies.actor import FlowActor
+from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 from sb3_flowpolicy.policies.sac import (
     CnnFlowPolicy,
     CnnGaussPolicy,
     CnnLowRankPolicy,
-    DistributionPolicy,
     FlowPolicy,
     GaussPolicy,
     LowRankPolicy,

@@ -77,7 +77,7 @@ class FlowActor(Actor):
         self.distribution = distribution
         self.distribution_kwargs = dict(distribution_kwargs or {})
 
-        self.latent_pi = nn.Sequential(*create_mlp(features_dim, -1, net_arch, activation_fn))
+        self.latent_pi = self._make_latent_pi()
         context_dim = net_arch[-1] if net_arch else features_dim
         action_dim = get_action_dim(action_space)
         density = make_distribution(
@@ -93,6 +93,11 @@ class FlowActor(Actor):
         self.action_dist = ActionDistributionAdapter(self.density)  # type: ignore[assignment]
         self.register_state_dict_post_hook(_lift_heads)
         self.register_load_state_dict_pre_hook(_lower_heads)
+
+    def _make_latent_pi(self) -> nn.Sequential:
+        """Build the hidden layers."""
+        layers = create_mlp(self.features_dim, -1, self.net_arch, self.activation_fn)
+        return nn.Sequential(*layers)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = BasePolicy._get_constructor_parameters(self)

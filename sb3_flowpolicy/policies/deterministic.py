@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_flowpolicy.policies.actor import FlowActor
@@ -29,7 +28,7 @@ def check_settings(mode: str, n_candidates: int, use_sde: bool) -> None:
 
 
 def best_actions(
-    actor: FlowActor, critic: ContinuousCritic, obs: PyTorchObs, mode: str, n_candidates: int
+    actor: FlowActor, critic: Any, obs: PyTorchObs, mode: str, n_candidates: int
 ) -> th.Tensor:
     """Choose the best of several candidates for each observation.
 
@@ -63,7 +62,8 @@ def best_actions(
         actions, score = actor.density.rsample_and_log_prob(h, noise.unsqueeze(1).expand(shape))
         if by_value:
             pairs = th.cat([seen.expand(n_candidates, *seen.shape), actions], dim=-1)
-            score = th.stack([q(pairs) for q in critic.q_networks]).amin(0).squeeze(-1)
+            # One value each, or the quantiles of its distribution.
+            score = th.stack([q(pairs).mean(-1) for q in critic.q_networks]).amin(0)
         chosen.append(actions[score.argmax(0), th.arange(len(h), device=h.device)])
     return th.cat(chosen)
 
