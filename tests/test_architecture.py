@@ -18,6 +18,7 @@ FLOORS = [
     "policies",
     "guard",
     "engine",
+    "noise_process",
     "settings",
     "bundle",
     "demonstrations",
@@ -40,7 +41,7 @@ FLOORS = [
 THIRD_PARTY = {
     "distributions": {"torch"},
     "density": {"torch", "numpy", "scipy", "sklearn", "matplotlib", "PIL", "tqdm"},
-    "policies": {"torch", "numpy", "gymnasium", "stable_baselines3"},
+    "policies": {"torch", "numpy", "gymnasium", "stable_baselines3", "sb3_contrib"},
 }
 
 
