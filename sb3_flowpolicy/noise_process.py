@@ -66,6 +66,7 @@ class NoiseProcess:
             decays, shares = _fit(float(color), int(horizon))
         self._decays = th.as_tensor(decays, dtype=th.float64).unsqueeze(-1)
         self._weights = th.as_tensor(shares, dtype=th.float64).sqrt().unsqueeze(-1)
+        #: Shape (N, J, M) of the white noise that one step consumes.
         self.white_shape = (n_envs, len(decays), noise_dim)
         self._values = th.zeros(self.white_shape, dtype=th.float64)
         self._starting = th.ones(n_envs, 1, 1, dtype=th.bool)
@@ -85,13 +86,13 @@ class NoiseProcess:
         self._starting.zero_()
         return (self._weights * self._values).sum(1).to(white.dtype)
 
-    def restart(self, ended: np.ndarray) -> None:
+    def restart(self, ended: np.ndarray | None = None) -> None:
         """Forget the past of environments whose episode ended.
 
         Args:
-            ended: Which, boolean of shape (N,).
+            ended: Which, boolean of shape (N,). Default: all.
         """
-        self._starting |= th.as_tensor(ended).view(-1, 1, 1)
+        self._starting |= True if ended is None else th.as_tensor(ended).view(-1, 1, 1)
 
     def state(self) -> dict[str, th.Tensor]:
         """Return what is needed to go on with the same process."""
@@ -111,18 +112,25 @@ class NoiseProcess:
         self._values, self._starting = state["values"].clone(), state["starting"].clone()
 
 
-def check_color(color: float, correlation_time: float | None) -> None:
-    """Raise ``ValueError`` unless these describe a process."""
-    if not 0 <= color <= MAX_COLOR:
-        raise ValueError(f"color must be between 0 (white) and {MAX_COLOR}, got {color}")
+def check_color(color: float, correlation_time: float | None, prefix: str = "") -> None:
+    """Raise ``ValueError`` unless these describe a process; names get a prefix in messages."""
+    if not _is_number(color) or not 0 <= color <= MAX_COLOR:
+        raise ValueError(f"{prefix}color must be between 0 (white) and {MAX_COLOR}, got {color!r}")
     if correlation_time is None:
         return
-    if not 0 < correlation_time < math.inf:
-        raise ValueError(f"correlation_time must be above 0 steps, got {correlation_time}")
+    if not _is_number(correlation_time) or not 0 < correlation_time < math.inf:
+        raise ValueError(
+            f"{prefix}correlation_time must be above 0 steps, got {correlation_time!r}"
+        )
     if color != 0:
         raise ValueError(
-            f"color must be 0 where correlation_time is given, got {color} and {correlation_time}"
+            f"{prefix}color must be 0 where {prefix}correlation_time is given, "
+            f"got {color} and {correlation_time}"
         )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 @lru_cache(maxsize=8)

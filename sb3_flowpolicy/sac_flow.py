@@ -28,9 +28,10 @@ from sb3_flowpolicy.demonstrations import (
     load_demonstrations,
 )
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
+from sb3_flowpolicy.exploration import ColoredExploration
 from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
 from sb3_flowpolicy.guard import TrainingGuard
-from sb3_flowpolicy.policies.off_policy import DistributionPolicy, check_finite_actions
+from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 from sb3_flowpolicy.settings import check_settings
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
@@ -42,7 +43,7 @@ MOST_DRAWN_AT_ONCE = 1000
 _SAC_ARGUMENTS = list(inspect.signature(SAC.__init__).parameters)[3:]
 
 
-class SACFlow(Resumable, Shareable, SAC):
+class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
     r"""Soft Actor-Critic with action distributions that correlate and bend.
 
     Everything of SB3's :class:`~stable_baselines3.SAC` holds. In particular a fixed temperature
@@ -70,7 +71,9 @@ class SACFlow(Resumable, Shareable, SAC):
         autocast: Whether matrix products run in bfloat16 (``torch.autocast``), on processors that
             have it 1.2 to 1.6 times as fast for networks of 128 units or more, and slower for small
             ones. Parameters, optimiser states and replay stay float32; products keep 8 bits.
-        **sac_kwargs: Keyword arguments of SB3's SAC.
+        **sac_kwargs: Keyword arguments of SB3's SAC, and ``action_noise_color`` (1.0: pink) or
+            ``action_noise_correlation_time`` for exploration that goes somewhere, see
+            :class:`~sb3_flowpolicy.exploration.ColoredExploration`.
 
     Raises:
         ValueError: If an argument is out of range, the environment's action space is no Box
@@ -211,12 +214,11 @@ class SACFlow(Resumable, Shareable, SAC):
             return super()._sample_action(random_steps, action_noise, n_envs)
         # What SB3 does, less what it spends on finding out that the observation is an array.
         obs = th.as_tensor(self._last_obs, device=self.device)
-        scaled = engine.act(obs.unsqueeze(0)).squeeze(0).cpu().numpy()
-        check_finite_actions(scaled)
-        scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
-        if action_noise is not None:
-            scaled = np.clip(scaled + action_noise(), -1, 1)
-        return self.policy.unscale_action(scaled), scaled
+        noise = self._exploration_noise(n_envs)
+        if noise is not None:
+            noise = noise.to(engine.networks.actor.data).unsqueeze(0)
+        scaled = engine.act(obs.unsqueeze(0), noise).squeeze(0).cpu().numpy()
+        return self._finished(scaled, action_noise, n_envs)
 
     def _store_transition(
         self,

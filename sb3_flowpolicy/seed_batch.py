@@ -39,7 +39,10 @@ from sb3_flowpolicy.seed_setup import (
 )
 
 # What agents must agree on, besides the constants of their updates.
-_COMMON = ("batch_size", "gamma", "learning_starts", "random_steps", "train_freq", "gradient_steps")
+_COMMON = (
+    *("batch_size", "gamma", "learning_starts", "random_steps", "train_freq", "gradient_steps"),
+    *("action_noise_color", "action_noise_correlation_time"),
+)
 
 
 class SeedBatch(BatchOnDisk):
@@ -115,9 +118,11 @@ class SeedBatch(BatchOnDisk):
         first = self._models[0]
         assert isinstance(first.actor, FlowActor)
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
+        self._process = process = first.make_noise_process(len(self.seeds), self._venv)
+        white_shape = (1, noise_dim) if process is None else process.white_shape[1:]
         return {
             "random actions": SeedNoise(self.seeds, shape, 0, uniform=True),
-            "actions": SeedNoise(self.seeds, (1, noise_dim), 1),
+            "actions": SeedNoise(self.seeds, white_shape, 1),
             "updates": SeedNoise(self.seeds, (2, first.batch_size, noise_dim), 2),
             "rows": SeedNoise(self.seeds, (first.batch_size,), 3, uniform=True),
         }
@@ -181,6 +186,8 @@ class SeedBatch(BatchOnDisk):
             self._obs, _ = self._venv.reset(seed=seeds)  # type: ignore[arg-type]
             check_experience({"observations": self._obs}, first.num_timesteps, self._who)
             self._episodes.restart()
+            if self._process is not None:
+                self._process.restart()
         to_go = first._total_timesteps - first.num_timesteps
         bar = make_progress_bar(to_go) if progress_bar else None
         try:
@@ -306,6 +313,8 @@ class SeedBatch(BatchOnDisk):
             timeouts=truncated & ~terminated,
         )
         self._obs = obs
+        if self._process is not None:
+            self._process.restart(dones)
         for model in self._models:
             model.num_timesteps += 1
             model._current_progress_remaining = 1 - model.num_timesteps / model._total_timesteps
@@ -331,6 +340,8 @@ class SeedBatch(BatchOnDisk):
             return (self._noise["random actions"].draw() * 2 - 1).float().numpy()
         assert self._engine is not None
         noise = self._noise["actions"].draw()
+        if self._process is not None:
+            noise = self._process.step(noise).unsqueeze(1)
         actions = self._engine.act(th.from_numpy(obs).unsqueeze(1), noise)
         return actions.squeeze(1).numpy().reshape(len(obs), *(first.action_space.shape or ()))
 

@@ -21,6 +21,7 @@ from sb3_flowpolicy.checkpoint.session import (
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.noise_process import NoiseProcess
 from sb3_flowpolicy.sac_flow import SACFlow
 from sb3_flowpolicy.seed_checkpoint import read_batch, write_batch
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
@@ -41,6 +42,7 @@ class BatchOnDisk:
     _obs: np.ndarray | None
     _losses: list[list[float]] | None
     _guard: TrainingGuard
+    _process: NoiseProcess | None
     _checkpoints: Checkpoints | None = None
     _resumption: Resumption | None = None
 
@@ -161,12 +163,15 @@ class BatchOnDisk:
             "episodes": self._episodes.state(),
             "obs": self._obs,
             "losses": self._losses,
+            "process": None if self._process is None else self._process.state(),
         }
 
     def _set_extra_state(self, state: dict[str, Any]) -> None:
         for name, one in self._noise.items():
             one.set_state(state["noise"][name])
         self._losses = state["losses"]
+        if self._process is not None:
+            self._process.set_state(state["process"])
         self._episodes.set_state(state["episodes"])
         if self._resumes_episodes():
             self._obs = state["obs"]

@@ -9,6 +9,8 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import TrainFreq
 
+from sb3_flowpolicy.noise_process import MAX_COLOR
+
 #: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
 
@@ -139,6 +141,8 @@ SETTINGS: dict[str, Check] = {
     "critic_loss_coef": number(0, above=True),
     "compile": either("auto", flag),
     "autocast": flag,
+    "action_noise_color": number(0, MAX_COLOR),
+    "action_noise_correlation_time": optional(number(0, above=True)),
 }
 
 # Arguments of the constructor that are no part of the agent, or no plain values.

@@ -34,6 +34,7 @@ _ATTRIBUTES = (
     "_num_timesteps_at_start",
     "_planned",
     "_worth_compiling",
+    "_noise_process",
 )
 
 

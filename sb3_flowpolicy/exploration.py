@@ -1,0 +1,150 @@
+"""Exploration that goes somewhere: noise that correlates in time, for off-policy algorithms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_flowpolicy.noise_process import NoiseProcess, check_color
+from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.policies.off_policy import check_finite_actions
+
+
+class ColoredExploration(OffPolicyAlgorithm):
+    """Mixin for SB3's off-policy algorithms, to be named before them.
+
+    While experience is collected, the density's noise comes from a :class:`NoiseProcess` per
+    environment, which begins anew with every episode: at a fixed state the distribution of actions
+    is what it always is, but successive actions lean the same way. Updates and ``predict`` go on
+    with independent noise.
+
+    Args:
+        *args: Arguments of the algorithm.
+        action_noise_color: Exponent of the noise's spectrum, in [0, 1.5]: 0 is white, 1 pink.
+        action_noise_correlation_time: Instead of a colour, steps after which the autocorrelation
+            of an Ornstein-Uhlenbeck process has fallen to 1/e, above 0.
+        **kwargs: Keyword arguments of the algorithm.
+
+    Raises:
+        ValueError: If one is out of range, both are given, or the policy has no density of ours.
+
+    References:
+        Pink Noise Is All You Need (Eberhard et al., 2023).
+
+    Example:
+        >>> from sb3_flowpolicy import SACFlow
+        >>> model = SACFlow("FlowPolicy", "Pendulum-v1", action_noise_color=1.0, random_steps=10)
+        >>> _ = model.learn(20)
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        action_noise_color: float = 0.0,
+        action_noise_correlation_time: float | None = None,
+        **kwargs: Any,
+    ) -> None:
+        check_color(action_noise_color, action_noise_correlation_time, "action_noise_")
+        self.action_noise_color = action_noise_color
+        self.action_noise_correlation_time = action_noise_correlation_time
+        self._noise_process: NoiseProcess | None = None
+        super().__init__(*args, **kwargs)
+
+    def make_noise_process(self, n_envs: int, env: Any) -> NoiseProcess | None:
+        """Return a new process that fits the policy and the episodes; None for white noise.
+
+        Args:
+            n_envs: Number of environments.
+            env: What steps them, for the length of its episodes.
+        """
+        if self.action_noise_color == 0 and self.action_noise_correlation_time is None:
+            return None
+        actor = self.policy.actor
+        if not isinstance(actor, FlowActor):
+            raise ValueError(
+                "action_noise_color must be 0 unless the policy is one of sb3_flowpolicy's with "
+                f"use_sde=False, got {self.action_noise_color} with {type(actor).__name__}"
+            )
+        return NoiseProcess(
+            actor.density.noise_dim,
+            n_envs,
+            self.action_noise_color,
+            self.action_noise_correlation_time,
+            horizon=_episode_length(env),
+        )
+
+    def _exploration_noise(self, n_envs: int) -> th.Tensor | None:
+        """Return the next noise (N, M) to act with; None where it is white."""
+        process = self._noise_process
+        if process is None or process.white_shape[0] != n_envs:
+            process = self._noise_process = self.make_noise_process(n_envs, self.env)
+        return None if process is None else process.step(th.randn(process.white_shape))
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        before = self._last_obs
+        found = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if self._noise_process is not None and self._last_obs is not before:
+            self._noise_process.restart()  # environments were reset
+        return found
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        warms_up = self.num_timesteps < learning_starts
+        noise = None if warms_up else self._exploration_noise(n_envs)
+        if noise is None:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        # As SB3, only that the noise is given.
+        self.policy.set_training_mode(False)
+        obs, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+        actor = self.policy.actor
+        assert isinstance(actor, FlowActor)
+        with th.no_grad():
+            scaled = actor(obs, noise=noise.to(next(actor.parameters()))).cpu().numpy()
+        return self._finished(scaled, action_noise, n_envs)
+
+    def _finished(
+        self, scaled: np.ndarray, action_noise: ActionNoise | None, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return actions for the environment and for the replay buffer."""
+        check_finite_actions(scaled)
+        scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _store_transition(
+        self,
+        replay_buffer: Any,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if self._noise_process is not None:
+            self._noise_process.restart(dones)
+
+
+def _episode_length(env: Any) -> int | None:
+    """Return after how many steps episodes are cut, None where nobody says."""
+    specs = env.get_attr("spec") if isinstance(env, VecEnv) else [getattr(env, "spec", None)]
+    steps = getattr(specs[0], "max_episode_steps", None) if specs else None
+    return steps if steps is None or steps >= 2 else None

@@ -1,0 +1,201 @@
+"""Coloured noise while collecting: the same actions at a fixed state, another way to go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from scipy import signal, stats
+from stable_baselines3.common.env_util import make_vec_env
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy import SACFlow, SeedBatch
+
+FAST: dict[str, Any] = {
+    "policy_kwargs": {"net_arch": [16, 16]},
+    "random_steps": 10,
+    "batch_size": 16,
+    "buffer_size": 2000,
+    "seed": 0,
+    "learning_starts": 10_000,
+}
+POLICIES = pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+
+
+def fixed_state(policy: str, n_envs: int = 1, **kwargs: Any) -> SACFlow:
+    """A model about to act, at one state, with weights off their initial values."""
+    model = SACFlow(policy, make_vec_env("TunnelDiagonal-v0", n_envs), **(FAST | kwargs))
+    th.manual_seed(1)
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.add_(0.2 * th.randn_like(parameter))
+    model.learn(max(12, 4 * n_envs))
+    model._last_obs = np.tile(np.float32([0.1, 0.2]), (n_envs, 1))
+    return model
+
+
+def act(model: SACFlow, steps: int) -> np.ndarray:
+    """Scaled actions (steps, N, 2), without moving."""
+    n_envs = model.n_envs
+    return np.stack([model._sample_action(0, n_envs=n_envs)[1] for _ in range(steps)])
+
+
+@POLICIES
+@pytest.mark.parametrize(
+    "color", [{"action_noise_color": 1.0}, {"action_noise_correlation_time": 8.0}]
+)
+def test_at_a_fixed_state_actions_are_distributed_as_ever(
+    policy: str, color: dict[str, float]
+) -> None:
+    white, colored = fixed_state(policy, 500), fixed_state(policy, 500, **color)
+    colored.actor.load_state_dict(white.actor.state_dict())
+    assert colored._noise_process is not None
+    colored._noise_process.restart()
+    (first, *_, last), (reference,) = act(colored, 6), act(white, 1)
+    along = np.array([[1, 0], [0, 1], [1, 1], [1, -1]]).T
+    for actions in (first, last):
+        for mine, theirs in zip((actions @ along).T, (reference @ along).T, strict=True):
+            assert stats.ks_2samp(mine, theirs).pvalue > 1e-3
+    # Independent from one environment to the next, but not from one step to the next.
+    assert np.corrcoef(first[:, 0], last[:, 0])[0, 1] > 0.1
+    assert abs(np.corrcoef(first[:-1, 0], first[1:, 0])[0, 1]) < 0.15
+
+
+def test_actions_have_the_slope_that_was_asked_for() -> None:
+    """Small actions of a normal distribution are as good as its noise."""
+    model = fixed_state("GaussPolicy", 40, action_noise_color=1.0)
+    with th.no_grad():
+        model.actor.density.base.log_std.weight.zero_()
+        model.actor.density.base.log_std.bias.fill_(-3.0)
+    values = np.arctanh(act(model, 640)).reshape(640, -1)
+    frequencies, power = signal.welch(values, nperseg=160, axis=0)
+    inside = (frequencies >= 1 / 40) & (frequencies <= 0.5)  # episodes are cut after 40 steps
+    octaves = np.floor(np.log2(frequencies[inside] * 40))
+    level = np.log(power[inside].mean(1))
+    points = [
+        (np.log(frequencies[inside][octaves == k]).mean(), level[octaves == k].mean())
+        for k in np.unique(octaves)
+    ]
+    assert np.polyfit(*np.transpose(points), 1)[0] == pytest.approx(-1, abs=0.1)
+
+
+def test_a_new_episode_begins_without_a_past() -> None:
+    model = fixed_state("GaussPolicy", 3, action_noise_correlation_time=1e6)
+    before = act(model, 2)
+    np.testing.assert_allclose(before[0], before[1], atol=1e-2)
+    obs = model._last_obs
+    assert isinstance(obs, np.ndarray)
+    assert model.replay_buffer is not None
+    dones = np.array([False, True, False])
+    infos: list[dict[str, Any]] = [{"terminal_observation": obs[0]} for _ in dones]
+    model._store_transition(model.replay_buffer, before[1], obs, np.zeros(3), dones, infos)
+    after = act(model, 1)[0]
+    np.testing.assert_allclose(after[[0, 2]], before[1][[0, 2]], atol=1e-2)
+    assert abs(after[1] - before[1][1]).max() > 1e-2
+
+
+def test_white_is_what_it_was() -> None:
+    plain = SACFlow("FlowPolicy", "Pendulum-v1", **FAST).learn(60)
+    white = SACFlow("FlowPolicy", "Pendulum-v1", action_noise_color=0.0, **FAST).learn(60)
+    assert plain.replay_buffer is not None
+    assert white.replay_buffer is not None
+    np.testing.assert_array_equal(plain.replay_buffer.actions, white.replay_buffer.actions)
+
+
+def test_compiled_or_not_the_actions_are_the_same() -> None:
+    found = []
+    for compiled in (False, True):
+        model = fixed_state("FlowPolicy", action_noise_color=0.5)
+        if compiled:
+            model._ready_engine()
+            assert model._engine is not None
+            model._engine.compiled = True  # takes the engine's path, whose function stays eager
+            model._engine._compiled_sample.broken = True
+        th.manual_seed(5)
+        found.append(act(model, 3))
+    np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6)
+
+
+def test_a_loaded_model_goes_on_with_the_same_process(tmp_path: Path) -> None:
+    model = fixed_state("GaussPolicy", action_noise_correlation_time=1e6)
+    before = act(model, 1)
+    model.save(tmp_path / "model")
+    loaded = SACFlow.load(tmp_path / "model", env=model.env, force_reset=False)
+    assert loaded.action_noise_correlation_time == 1e6
+    loaded._last_obs = model._last_obs
+    np.testing.assert_allclose(act(loaded, 1), before, atol=1e-2)
+
+
+@pytest.mark.parametrize("kind", ["agent", "batch"])
+def test_a_resumed_run_is_the_undisturbed_one(kind: str, tmp_path: Path) -> None:
+    settings = FAST | {"learning_starts": 10, "action_noise_color": 1.0}
+    if kind == "batch":
+        del settings["seed"]
+
+    def new() -> Any:
+        if kind == "agent":
+            return SACFlow("FlowPolicy", make_vec_env("TunnelDiagonal-v0", 1), **settings)
+        return SeedBatch("FlowPolicy", "TunnelDiagonal-v0", [3, 4], **settings)
+
+    def state(run: Any) -> list[np.ndarray]:
+        models = [run] if kind == "agent" else run.models
+        return [
+            array
+            for one in models
+            for array in (
+                one.replay_buffer.actions[:80],
+                *(value.numpy() for value in one.policy.state_dict().values()),
+            )
+        ]
+
+    expected = state(new().learn(80))
+    path = tmp_path / "checkpoints"
+    new().learn(45, checkpoint_every=15, checkpoint_path=path)
+    # The last one is that of the end; its run had planned less, which changes no number here.
+    if kind == "agent":
+        run = SACFlow.resume(path, make_vec_env("TunnelDiagonal-v0", 1))
+    else:
+        run = SeedBatch.resume(path, "TunnelDiagonal-v0")
+    for mine, theirs in zip(state(run.learn(80)), expected, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_batch_explores_in_the_same_way() -> None:
+    settings = {key: value for key, value in FAST.items() if key != "seed"}
+    batch = SeedBatch(
+        "GaussPolicy", "TunnelDiagonal-v0", 2, action_noise_correlation_time=1e6, **settings
+    ).learn(200)
+    buffer = batch.models[0].replay_buffer
+    assert buffer is not None
+    actions, ends = buffer.actions[10:200, 0], buffer.dones[10:200, 0].astype(bool)
+    steps = np.abs(np.diff(actions, axis=0)).max(1)
+    # Within an episode only the state moves the action; between two of them the noise is new.
+    assert np.median(steps[ends[:-1]]) > 5 * np.median(steps[~ends[:-1]])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"action_noise_color": -1}, "action_noise_color must be"),
+        ({"action_noise_color": "pink"}, "action_noise_color must be"),
+        ({"action_noise_correlation_time": 0.0}, "action_noise_correlation_time must be above 0"),
+        (
+            {"action_noise_color": 1.0, "action_noise_correlation_time": 3.0},
+            "action_noise_color must be 0 where action_noise_correlation_time is given",
+        ),
+    ],
+)
+def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SACFlow("FlowPolicy", "Pendulum-v1", **arguments)
+
+
+def test_gsde_has_noise_of_its_own() -> None:
+    model = SACFlow(
+        "GaussPolicy", "Pendulum-v1", use_sde=True, action_noise_color=1.0, learning_starts=0
+    )
+    with pytest.raises(ValueError, match="action_noise_color must be 0 unless the policy is one"):
+        model.learn(5)
