@@ -71,9 +71,12 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         autocast: Whether matrix products run in bfloat16 (``torch.autocast``), on processors that
             have it 1.2 to 1.6 times as fast for networks of 128 units or more, and slower for small
             ones. Parameters, optimiser states and replay stay float32; products keep 8 bits.
-        **sac_kwargs: Keyword arguments of SB3's SAC, and ``action_noise_color`` (1.0: pink) or
-            ``action_noise_correlation_time`` for exploration that goes somewhere, see
-            :class:`~sb3_flowpolicy.exploration.ColoredExploration`.
+        action_noise_color: Exponent of the spectrum of the noise to explore with, in [0, 1.5]: 0 is
+            white, 1 pink. Successive actions then lean the same way, while at a fixed state they
+            are distributed as ever; see :class:`~sb3_flowpolicy.exploration.ColoredExploration`.
+        action_noise_correlation_time: Instead of a colour, the correlation time of an
+            Ornstein-Uhlenbeck process in steps, above 0.
+        **sac_kwargs: Keyword arguments of SB3's SAC.
 
     Raises:
         ValueError: If an argument is out of range, the environment's action space is no Box
@@ -114,6 +117,8 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         critic_loss_coef: float = SB3_CRITIC_LOSS_COEF,
         compile: bool | Literal["auto"] = "auto",
         autocast: bool = False,
+        action_noise_color: float = 0.0,
+        action_noise_correlation_time: float | None = None,
         **sac_kwargs: Any,
     ) -> None:
         check_settings(
@@ -124,6 +129,8 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
                 "critic_loss_coef": critic_loss_coef,
                 "compile": compile,
                 "autocast": autocast,
+                "action_noise_color": action_noise_color,
+                "action_noise_correlation_time": action_noise_correlation_time,
             }
         )
         self.random_steps = random_steps
@@ -141,7 +148,14 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             else load_demonstrations(demonstrations)
         )
         try:
-            super().__init__(policy, env, *sac_args, **sac_kwargs)
+            super().__init__(
+                policy,
+                env,
+                *sac_args,
+                action_noise_color=action_noise_color,
+                action_noise_correlation_time=action_noise_correlation_time,
+                **sac_kwargs,
+            )
         except AssertionError as error:  # how SB3 refuses an environment
             raise ValueError(str(error)) from error
 
