@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sb3_flowpolicy.bundle import BundleError
     from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
+    from sb3_flowpolicy.contrib import CrossQFlow, TQCFlow
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
     from sb3_flowpolicy.export import export_onnx
     from sb3_flowpolicy.finite import NonFiniteError
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
         MultiInputFlowActorCriticPolicy,
         MultiInputLowRankActorCriticPolicy,
     )
+    from sb3_flowpolicy.ppo_flow import PPOFlow
     from sb3_flowpolicy.sac_flow import SACFlow
     from sb3_flowpolicy.seed_batch import SeedBatch
 
@@ -63,6 +65,7 @@ __all__ = [
     "CnnLowRankActorCriticPolicy",
     "CnnLowRankPolicy",
     "CnnLowRankTQCPolicy",
+    "CrossQFlow",
     "FlowActorCriticPolicy",
     "FlowCrossQPolicy",
     "FlowPolicy",
@@ -83,9 +86,11 @@ __all__ = [
     "MultiInputLowRankPolicy",
     "MultiInputLowRankTQCPolicy",
     "NonFiniteError",
+    "PPOFlow",
     "RunCheckpointCallback",
     "SACFlow",
     "SeedBatch",
+    "TQCFlow",
     "export_onnx",
     "has_checkpoint",
     "register_distribution",
@@ -99,6 +104,7 @@ _ELSEWHERE = {
     "CnnGaussTQCPolicy": "policies.contrib",
     "CnnLowRankActorCriticPolicy": "policies.on_policy",
     "CnnLowRankTQCPolicy": "policies.contrib",
+    "CrossQFlow": "contrib",
     "FlowActorCriticPolicy": "policies.on_policy",
     "FlowCrossQPolicy": "policies.contrib",
     "FlowTQCPolicy": "policies.contrib",
@@ -113,9 +119,11 @@ _ELSEWHERE = {
     "MultiInputLowRankActorCriticPolicy": "policies.on_policy",
     "MultiInputLowRankTQCPolicy": "policies.contrib",
     "NonFiniteError": "finite",
+    "PPOFlow": "ppo_flow",
     "RunCheckpointCallback": "checkpoint",
     "SACFlow": "sac_flow",
     "SeedBatch": "seed_batch",
+    "TQCFlow": "contrib",
     "export_onnx": "export",
     "has_checkpoint": "checkpoint",
     "register_distribution": "distributions",

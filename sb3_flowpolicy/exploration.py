@@ -9,7 +9,6 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flowpolicy.noise_process import NoiseProcess, check_color
@@ -87,18 +86,9 @@ class ColoredExploration(OffPolicyAlgorithm):
             process = self._noise_process = self.make_noise_process(n_envs, self.env)
         return None if process is None else process.step(th.randn(process.white_shape))
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         before = self._last_obs
-        found = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        found = super()._setup_learn(*args, **kwargs)
         if self._noise_process is not None and self._last_obs is not before:
             self._noise_process.restart()  # environments were reset
         return found

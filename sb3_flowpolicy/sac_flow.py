@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
@@ -181,14 +181,7 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             self.replay_buffer, self.policy, load_demonstrations(demonstrations)
         )
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.replay_buffer is None:
             raise ValueError("learn() needs a replay buffer: give env to load_safe to train on")
         # Here and not at construction: a model that is loaded to act needs no demonstrations.
@@ -199,9 +192,7 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
                 self._demonstrations = recorded
             self.add_demonstrations(self._demonstrations)
             self._demonstrations = None
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         self._guard.restart()
         self._guard.resume_from = None if self._checkpoints is None else self._checkpoints.path
         normalized = self._vec_normalize_env is not None

@@ -25,6 +25,8 @@ FLOORS = [
     "vec_env",
     "checkpoint",
     "exploration",
+    "contrib",
+    "ppo_flow",
     "sac_flow",
     "export",
     "seed_episodes",

@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_flowpolicy.diagnostics.figures import correlation_figure, samples_figure
 from sb3_flowpolicy.diagnostics.layout import DASHBOARD
 from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.policies.deterministic import critic_values
 
 # Pictures belong on TensorBoard; the text formats of SB3's logger refuse them.
 _TEXT_FORMATS = ("stdout", "log", "json", "csv")
@@ -106,8 +107,9 @@ class PolicyDiagnosticsCallback(BaseCallback):
         noise = actor.draw_noise(context, self.n_samples)
         actions, log_prob = actor.density.rsample_and_log_prob(context, noise)
         correlation = actor.action_correlation(obs, self.n_samples).abs().mean(0)
-        q_policy = th.cat(critic(obs, actions[0]), dim=1)
-        q_buffer = th.cat(critic(obs, buffer_actions), dim=1)
+        features = critic.extract_features(obs, critic.features_extractor)
+        q_policy = critic_values(critic, features, actions[0])
+        q_buffer = critic_values(critic, features, buffer_actions)
         self.model.policy.set_training_mode(was_training)
 
         record = self.logger.record

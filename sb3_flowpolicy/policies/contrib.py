@@ -9,10 +9,11 @@ from sb3_contrib.common.torch_layers import BatchRenorm1d
 from sb3_contrib.crossq.policies import Actor as StockCrossQActor
 from sb3_contrib.crossq.policies import CrossQPolicy
 from sb3_contrib.tqc.policies import TQCPolicy
-from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN, create_mlp
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
 from sb3_flowpolicy.policies.actor import FlowActor
+from sb3_flowpolicy.policies.extractors import for_dicts, for_images
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 
@@ -50,40 +51,9 @@ class FlowTQCPolicy(DistributionPolicy, TQCPolicy):
     default_distribution = "realnvp"
 
 
-class CnnGaussTQCPolicy(GaussTQCPolicy):
-    """:class:`GaussTQCPolicy` for image observations."""
-
-    default_features_extractor_class = NatureCNN
-
-
-class CnnLowRankTQCPolicy(LowRankTQCPolicy):
-    """:class:`LowRankTQCPolicy` for image observations."""
-
-    default_features_extractor_class = NatureCNN
-
-
-class CnnFlowTQCPolicy(FlowTQCPolicy):
-    """:class:`FlowTQCPolicy` for image observations."""
-
-    default_features_extractor_class = NatureCNN
-
-
-class MultiInputGaussTQCPolicy(GaussTQCPolicy):
-    """:class:`GaussTQCPolicy` for dictionary observations."""
-
-    default_features_extractor_class = CombinedExtractor
-
-
-class MultiInputLowRankTQCPolicy(LowRankTQCPolicy):
-    """:class:`LowRankTQCPolicy` for dictionary observations."""
-
-    default_features_extractor_class = CombinedExtractor
-
-
-class MultiInputFlowTQCPolicy(FlowTQCPolicy):
-    """:class:`FlowTQCPolicy` for dictionary observations."""
-
-    default_features_extractor_class = CombinedExtractor
+_FOR_TQC = (GaussTQCPolicy, LowRankTQCPolicy, FlowTQCPolicy)
+CnnGaussTQCPolicy, CnnLowRankTQCPolicy, CnnFlowTQCPolicy = for_images(*_FOR_TQC)
+MultiInputGaussTQCPolicy, MultiInputLowRankTQCPolicy, MultiInputFlowTQCPolicy = for_dicts(*_FOR_TQC)
 
 
 class CrossQFlowActor(FlowActor):

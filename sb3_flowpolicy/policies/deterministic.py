@@ -61,11 +61,25 @@ def best_actions(
         shape = (n_candidates, len(h), actor.density.noise_dim)
         actions, score = actor.density.rsample_and_log_prob(h, noise.unsqueeze(1).expand(shape))
         if by_value:
-            pairs = th.cat([seen.expand(n_candidates, *seen.shape), actions], dim=-1)
-            # One value each, or the quantiles of its distribution.
-            score = th.stack([q(pairs).mean(-1) for q in critic.q_networks]).amin(0)
+            score = critic_values(critic, seen.expand(n_candidates, *seen.shape), actions).amin(0)
         chosen.append(actions[score.argmax(0), th.arange(len(h), device=h.device)])
     return th.cat(chosen)
+
+
+def critic_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """Return what the critics of SAC, TQC or CrossQ expect of actions.
+
+    Args:
+        critic: Critics of a policy.
+        features: What their extractor made of observations, (..., F).
+        actions: Actions in [-1, 1], (..., D).
+
+    Returns:
+        Values, (n_critics, ...).
+    """
+    pairs = th.cat([features, actions], dim=-1)
+    # One value each, or the quantiles of its distribution.
+    return th.stack([q_network(pairs).mean(-1) for q_network in critic.q_networks])
 
 
 @lru_cache(maxsize=8)

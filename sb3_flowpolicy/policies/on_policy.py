@@ -11,11 +11,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.policies.extractors import for_dicts, for_images
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # Of SB3's normal distributions, which are not built.
@@ -51,6 +52,7 @@ class DensityActorCritic(ActorCriticPolicy):
     """
 
     default_distribution: ClassVar[str]
+    default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -87,6 +89,7 @@ class DensityActorCritic(ActorCriticPolicy):
         self.distribution = self.default_distribution if distribution is None else distribution
         self.distribution_kwargs = dict(distribution_kwargs or {})
         self._squashes = squash_output
+        policy_kwargs.setdefault("features_extractor_class", self.default_features_extractor_class)
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
         # SB3's constructor allows it to gSDE only, though all of SB3 that reads it is ready for us.
         self._squash_output = squash_output
@@ -145,29 +148,6 @@ class LowRankActorCriticPolicy(DensityActorCritic):
     default_distribution = "low_rank"
 
 
-class _ForImages(DensityActorCritic):
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        kwargs.setdefault("features_extractor_class", NatureCNN)
-        super().__init__(*args, **kwargs)
-
-
-class _ForDicts(DensityActorCritic):
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        kwargs.setdefault("features_extractor_class", CombinedExtractor)
-        super().__init__(*args, **kwargs)
-
-
-class CnnFlowActorCriticPolicy(_ForImages, FlowActorCriticPolicy):
-    """:class:`FlowActorCriticPolicy` for image observations."""
-
-
-class CnnLowRankActorCriticPolicy(_ForImages, LowRankActorCriticPolicy):
-    """:class:`LowRankActorCriticPolicy` for image observations."""
-
-
-class MultiInputFlowActorCriticPolicy(_ForDicts, FlowActorCriticPolicy):
-    """:class:`FlowActorCriticPolicy` for dictionary observations."""
-
-
-class MultiInputLowRankActorCriticPolicy(_ForDicts, LowRankActorCriticPolicy):
-    """:class:`LowRankActorCriticPolicy` for dictionary observations."""
+_POLICIES = (FlowActorCriticPolicy, LowRankActorCriticPolicy)
+CnnFlowActorCriticPolicy, CnnLowRankActorCriticPolicy = for_images(*_POLICIES)
+MultiInputFlowActorCriticPolicy, MultiInputLowRankActorCriticPolicy = for_dicts(*_POLICIES)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_flowpolicy.policies.extractors import for_dicts, for_images
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 
@@ -46,37 +46,6 @@ class FlowPolicy(DistributionPolicy, SACPolicy):
     default_distribution = "realnvp"
 
 
-class CnnGaussPolicy(GaussPolicy):
-    """:class:`GaussPolicy` for image observations."""
-
-    default_features_extractor_class = NatureCNN
-
-
-class CnnLowRankPolicy(LowRankPolicy):
-    """:class:`LowRankPolicy` for image observations."""
-
-    default_features_extractor_class = NatureCNN
-
-
-class CnnFlowPolicy(FlowPolicy):
-    """:class:`FlowPolicy` for image observations."""
-
-    default_features_extractor_class = NatureCNN
-
-
-class MultiInputGaussPolicy(GaussPolicy):
-    """:class:`GaussPolicy` for dictionary observations."""
-
-    default_features_extractor_class = CombinedExtractor
-
-
-class MultiInputLowRankPolicy(LowRankPolicy):
-    """:class:`LowRankPolicy` for dictionary observations."""
-
-    default_features_extractor_class = CombinedExtractor
-
-
-class MultiInputFlowPolicy(FlowPolicy):
-    """:class:`FlowPolicy` for dictionary observations."""
-
-    default_features_extractor_class = CombinedExtractor
+_POLICIES = (GaussPolicy, LowRankPolicy, FlowPolicy)
+CnnGaussPolicy, CnnLowRankPolicy, CnnFlowPolicy = for_images(*_POLICIES)
+MultiInputGaussPolicy, MultiInputLowRankPolicy, MultiInputFlowPolicy = for_dicts(*_POLICIES)

@@ -8,8 +8,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-ALGORITHMS = ("sac_flow", "sac_lowrank", "sac_gauss")
-"""Names for `--algo`. All are `SACFlow`: the policy is named in the hyperparameter file."""
+_CLASSES = {
+    "sac_flow": ("sac_flow", "SACFlow"),
+    "sac_lowrank": ("sac_flow", "SACFlow"),
+    "sac_gauss": ("sac_flow", "SACFlow"),
+    "tqc_flow": ("contrib", "TQCFlow"),
+    "crossq_flow": ("contrib", "CrossQFlow"),
+    "ppo_flow": ("ppo_flow", "PPOFlow"),
+    "ppo_lowrank": ("ppo_flow", "PPOFlow"),
+}
+ALGORITHMS = tuple(_CLASSES)
+"""Names for `--algo`. Each has a hyperparameter file, which names the policy."""
 
 _MARK = "_knows_sb3_flowpolicy"
 
@@ -64,9 +73,10 @@ def plug_in(module: ModuleType) -> None:
 
 def _plug_into_utils(module: ModuleType) -> None:
     import flowpolicy_envs  # noqa: F401, registers the environments
-    from sb3_flowpolicy.sac_flow import SACFlow
 
-    module.ALGOS.update(dict.fromkeys(ALGORITHMS, SACFlow))
+    for name, (where, class_name) in _CLASSES.items():
+        algorithm = getattr(importlib.import_module(f"sb3_flowpolicy.{where}"), class_name)
+        module.ALGOS[name] = algorithm
 
 
 def _plug_into_hyperparams_opt(module: ModuleType) -> None:

@@ -1,4 +1,4 @@
-"""Optuna search spaces: rl_zoo3's for SAC, plus the shape of the action distribution.
+"""Optuna search spaces: rl_zoo3's for SAC, TQC and PPO, plus the shape of the action distribution.
 
 rl_zoo3 lets the sampled `policy_kwargs` replace those of the YAML file. Ours are laid over them,
 so that weight decay and the like stay as configured. For `--trial-id`, rl_zoo3 hands the converter
@@ -9,6 +9,7 @@ import ast
 import json
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,11 +24,12 @@ _KEPT = "kept_policy_kwargs"
 _TUNED = ("layers", "hidden", "rank")
 
 
-def convert(params: dict[str, Any]) -> dict[str, Any]:
-    """Turn the parameters of a trial into arguments of `SACFlow`.
+def convert(params: dict[str, Any], off_policy: bool = True) -> dict[str, Any]:
+    """Turn the parameters of a trial into arguments of the algorithm.
 
     Args:
         params: `trial.params` of a trial that one of `SAMPLERS` filled.
+        off_policy: False for PPO.
 
     Returns:
         Keyword arguments, `policy_kwargs` complete.
@@ -37,21 +39,23 @@ def convert(params: dict[str, Any]) -> dict[str, Any]:
         >>> convert(params)["policy_kwargs"]
         {'net_arch': [64, 64], 'distribution_kwargs': {'rank': 3}}
     """
-    from rl_zoo3.hyperparams_opt import convert_offpolicy_params
+    from rl_zoo3 import hyperparams_opt
 
-    sac = {name: value for name, value in params.items() if name not in (_KEPT, *_TUNED)}
-    return _complete(convert_offpolicy_params(sac), params)
+    theirs = {name: value for name, value in params.items() if name not in (_KEPT, *_TUNED)}
+    kind = "offpolicy" if off_policy else "onpolicy"
+    return _complete(getattr(hyperparams_opt, f"convert_{kind}_params")(theirs), params)
 
 
-def _sampler(suggest: Callable[["optuna.Trial", int], None]) -> Sampler:
-    """Build a sampler out of what it suggests in addition to rl_zoo3's sampler for SAC."""
+def _sampler(suggest: Callable[["optuna.Trial", int], None], algorithm: str = "sac") -> Sampler:
+    """Build a sampler out of what it suggests in addition to rl_zoo3's sampler."""
 
     def sample(
         trial: "optuna.Trial", n_actions: int, n_envs: int, additional_args: dict[str, Any]
     ) -> dict[str, Any]:
-        from rl_zoo3.hyperparams_opt import sample_sac_params
+        from rl_zoo3 import hyperparams_opt
 
-        hyperparams = sample_sac_params(trial, n_actions, n_envs, additional_args)
+        theirs = getattr(hyperparams_opt, f"sample_{algorithm}_params")
+        hyperparams = theirs(trial, n_actions, n_envs, additional_args)
         suggest(trial, n_actions)
         trial.suggest_categorical(_KEPT, [json.dumps(_configured_policy_kwargs(trial))])
         return _complete(hyperparams, trial.params)
@@ -103,5 +107,12 @@ SAMPLERS: dict[str, Sampler] = {
     "sac_flow": _sampler(_suggest_flow),
     "sac_lowrank": _sampler(_suggest_lowrank),
     "sac_gauss": _sampler(_suggest_nothing),
+    "tqc_flow": _sampler(_suggest_flow, "tqc"),
+    "ppo_flow": _sampler(_suggest_flow, "ppo"),
+    "ppo_lowrank": _sampler(_suggest_lowrank, "ppo"),
 }
-CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = dict.fromkeys(SAMPLERS, convert)
+"""For `--optimize`; rl_zoo3 has none for CrossQ, and neither have we."""
+
+CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    name: partial(convert, off_policy=not name.startswith("ppo")) for name in SAMPLERS
+}

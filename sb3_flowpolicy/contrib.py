@@ -1,0 +1,83 @@
+"""sb3-contrib's TQC and CrossQ with our policies by name, coloured exploration and exact resume."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from sb3_contrib import TQC, CrossQ
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_flowpolicy.checkpoint import Resumable
+from sb3_flowpolicy.exploration import ColoredExploration
+from sb3_flowpolicy.policies import contrib as policies
+
+
+class TQCFlow(Resumable, ColoredExploration, TQC):
+    """Truncated Quantile Critics with action distributions that correlate and bend.
+
+    Everything of sb3-contrib's :class:`~sb3_contrib.TQC` holds. Besides, ``action_noise_color`` and
+    ``action_noise_correlation_time`` make exploration directed, see
+    :class:`~sb3_flowpolicy.exploration.ColoredExploration`, and :meth:`learn` takes
+    ``checkpoint_every`` and ``checkpoint_path``. Updates are sb3-contrib's own: the fast engine is
+    :class:`~sb3_flowpolicy.SACFlow`'s alone.
+
+    Args:
+        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``,
+            their ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
+        env: Environment, its registered id, or a ``VecEnv``.
+        *args: Further arguments of TQC, in its order.
+        **kwargs: Keyword arguments of TQC and of ``ColoredExploration``.
+
+    References:
+        Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile
+        Critics (Kuznetsov et al., 2020).
+
+    Example:
+        >>> model = TQCFlow("FlowPolicy", "Pendulum-v1", action_noise_color=1.0, learning_starts=9)
+        >>> _ = model.learn(20)
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.FlowTQCPolicy,
+        "CnnPolicy": policies.CnnFlowTQCPolicy,
+        "MultiInputPolicy": policies.MultiInputFlowTQCPolicy,
+        "FlowPolicy": policies.FlowTQCPolicy,
+        "CnnFlowPolicy": policies.CnnFlowTQCPolicy,
+        "MultiInputFlowPolicy": policies.MultiInputFlowTQCPolicy,
+        "LowRankPolicy": policies.LowRankTQCPolicy,
+        "CnnLowRankPolicy": policies.CnnLowRankTQCPolicy,
+        "MultiInputLowRankPolicy": policies.MultiInputLowRankTQCPolicy,
+        "GaussPolicy": policies.GaussTQCPolicy,
+        "CnnGaussPolicy": policies.CnnGaussTQCPolicy,
+        "MultiInputGaussPolicy": policies.MultiInputGaussTQCPolicy,
+    }
+
+
+class CrossQFlow(Resumable, ColoredExploration, CrossQ):
+    """CrossQ with action distributions that correlate and bend.
+
+    Everything of sb3-contrib's :class:`~sb3_contrib.CrossQ` holds, and what :class:`TQCFlow` adds.
+    Like CrossQ it takes vectors as observations, no images or dictionaries.
+
+    Args:
+        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``, or a
+            policy class.
+        env: Environment, its registered id, or a ``VecEnv``.
+        *args: Further arguments of CrossQ, in its order.
+        **kwargs: Keyword arguments of CrossQ and of ``ColoredExploration``.
+
+    References:
+        CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).
+
+    Example:
+        >>> kwargs = dict(net_arch=[16])
+        >>> model = CrossQFlow("LowRankPolicy", "Pendulum-v1", policy_kwargs=kwargs, seed=0)
+        >>> _ = model.learn(20)
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.FlowCrossQPolicy,
+        "FlowPolicy": policies.FlowCrossQPolicy,
+        "LowRankPolicy": policies.LowRankCrossQPolicy,
+        "GaussPolicy": policies.GaussCrossQPolicy,
+    }

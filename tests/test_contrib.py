@@ -1,0 +1,97 @@
+"""TQCFlow and CrossQFlow: policies by name, directed exploration, runs that can be resumed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy import CrossQFlow, PPOFlow, TQCFlow
+from sb3_flowpolicy.diagnostics import PolicyDiagnosticsCallback
+
+ENV = "TunnelDiagonal-v0"
+OFF_POLICY: Any = pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
+
+
+def make(algorithm: Any, policy: str = "FlowPolicy", **kwargs: Any) -> Any:
+    settings = {"learning_starts": 20, "batch_size": 16, "buffer_size": 300, "seed": 0}
+    settings |= {"policy_kwargs": {"net_arch": [16, 16]}, "device": "cpu"} | kwargs
+    return algorithm(policy, ENV, **settings)
+
+
+class BrokenError(Exception):
+    """What a run dies of here."""
+
+
+class BreakAt(BaseCallback):
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.step:
+            raise BrokenError
+        return True
+
+
+@OFF_POLICY
+def test_a_broken_run_goes_on_bit_for_bit(algorithm: Any, tmp_path: Path) -> None:
+    """The coloured noise, and CrossQ's batch renormalisation, are part of what is resumed."""
+    settings: Any = {"action_noise_color": 1.0, "ent_coef": "auto"}
+    th.manual_seed(0)
+    calm = make(algorithm, **settings).learn(90)
+    th.manual_seed(0)
+    broken = make(algorithm, **settings)
+    with pytest.raises(BrokenError):
+        broken.learn(90, BreakAt(67), checkpoint_every=20, checkpoint_path=tmp_path)
+    th.manual_seed(1)
+    resumed = algorithm.resume(tmp_path, ENV, device="cpu")
+    assert resumed.num_timesteps == 60
+    resumed.learn(90)
+    expected, found = calm.policy.state_dict(), resumed.policy.state_dict()
+    assert expected.keys() == found.keys()
+    assert not [name for name, value in expected.items() if not th.equal(value, found[name])]
+    np.testing.assert_array_equal(calm.replay_buffer.actions, resumed.replay_buffer.actions)
+
+
+@OFF_POLICY
+def test_colour_changes_exploration_and_is_saved(algorithm: Any, tmp_path: Path) -> None:
+    white, pink = (make(algorithm, action_noise_color=color).learn(60) for color in (0.0, 1.0))
+    assert not np.array_equal(white.replay_buffer.actions, pink.replay_buffer.actions)
+    pink.save(tmp_path / "model")
+    assert algorithm.load(tmp_path / "model").action_noise_color == 1.0
+
+
+@OFF_POLICY
+def test_values_in_the_diagnostics_are_the_critics(algorithm: Any) -> None:
+    model = make(algorithm)
+    model.learn(60, PolicyDiagnosticsCallback(log_freq=60, image_freq=0))
+    logged = model.logger.name_to_value
+    assert np.isfinite([logged["value/q_policy"], logged["value/q_buffer"]]).all()
+    data = model.replay_buffer.sample(2000)
+    model.policy.set_training_mode(False)
+    with th.no_grad():
+        values = model.critic(data.observations, data.actions)
+    mean = values.mean() if algorithm is TQCFlow else th.cat(values).mean()
+    assert logged["value/q_buffer"] == pytest.approx(mean.item(), abs=0.1)
+
+
+@pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow, PPOFlow])
+def test_names_of_policies(algorithm: Any) -> None:
+    settings = {} if algorithm is not PPOFlow else {"n_steps": 32}
+    for name, policy in algorithm.policy_aliases.items():
+        if name.startswith(("Cnn", "MultiInput")):
+            continue
+        assert type(algorithm(name, ENV, device="cpu", **settings).policy) is policy
+    with pytest.raises(ValueError, match="Policy NoPolicy unknown"):
+        algorithm("NoPolicy", ENV)
+
+
+def test_on_policy_algorithms_have_no_coloured_noise() -> None:
+    with pytest.raises(ValueError, match=r"off-policy algorithms: .* got {'action_noise_color': 1"):
+        PPOFlow("FlowPolicy", ENV, action_noise_color=1.0)
