@@ -18,6 +18,9 @@ limit. All blocks do one update per step, which is what takes the time. What a r
 its ``.done.json`` files.
 """
 
+GSDE_STEPS_PER_SECOND = 250.0
+"""gSDE runs in SB3's own loop, one seed after the other, whatever the size of small networks."""
+
 _START_SECONDS = 40
 """Starting a process and compiling."""
 
@@ -31,7 +34,10 @@ def item_seconds(item: WorkItem) -> float:
     algo = {"GaussPolicy": "sac_gauss", "LowRankPolicy": "sac_lowrank"}.get(
         settings["policy"], "sac_flow"
     )
-    return _START_SECONDS + item.steps * len(item.seeds) / STEPS_PER_SECOND[width][algo]
+    speed = STEPS_PER_SECOND[width][algo]
+    if settings.get("use_sde"):
+        speed = min(speed, GSDE_STEPS_PER_SECOND)
+    return _START_SECONDS + item.steps * len(item.seeds) / speed
 
 
 def plan_seconds(plan: Plan, workers: int) -> float:

@@ -8,12 +8,19 @@ import gymnasium as gym
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.experiment import Experiment
+from sb3_flowpolicy.experiments.exploration_claims import EXPLORATION_CLAIMS
 from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS
 from sb3_flowpolicy.experiments.measures import MEASURES, TRAINING_INFOS
 from sb3_flowpolicy.experiments.tunnel_claims import TUNNEL_CLAIMS
 
 EXPERIMENTS: dict[str, Experiment] = {
-    one.name: one for one in (*FURTHER_CLAIMS[:2], *TUNNEL_CLAIMS, *FURTHER_CLAIMS[2:])
+    one.name: one
+    for one in (
+        *FURTHER_CLAIMS[:2],
+        *TUNNEL_CLAIMS,
+        *FURTHER_CLAIMS[2:],
+        *EXPLORATION_CLAIMS,
+    )
 }
 """Name to experiment, in the order of the claims."""
 

@@ -39,8 +39,10 @@ def actor_of(model: SACFlow) -> FlowActor:
     return model.actor
 
 
-def policy_entropy(model: SACFlow, seed: int) -> float:
-    """Estimate the policy's mean entropy at states of the replay buffer, nats."""
+def policy_entropy(model: SACFlow, seed: int) -> float | None:
+    """Estimate the policy's mean entropy at states of the replay buffer, nats; None for gSDE."""
+    if not isinstance(model.actor, FlowActor):
+        return None
     obs = _buffer_states(model, seed)
     with own_random_numbers(seed, model.num_timesteps, 1):
         return actor_of(model).entropy(obs, N_SAMPLES).mean().item()
@@ -163,10 +165,11 @@ def policy_picture(model: SACFlow, env_id: str, seed: int) -> dict[str, Any] | N
     Returns:
         ``steps``, ``positions`` and ``samples`` (actions), at states spread evenly over the
         episode, and ``trail``, all its positions; None unless the environment is a
-        two-dimensional Tunnel.
+        two-dimensional Tunnel and the policy's actions have a density.
     """
     env: gym.Env = make_env(env_id)
-    if not hasattr(env.unwrapped, "set_action_samples") or env.action_space.shape != (2,):
+    drawable = hasattr(env.unwrapped, "set_action_samples") and env.action_space.shape == (2,)
+    if not drawable or not isinstance(model.actor, FlowActor):
         return None
     obs, _ = env.reset(seed=seed)
     states, done = [obs], False

@@ -20,6 +20,7 @@ from sb3_flowpolicy.experiments.measures import (
     policy_entropy,
     policy_picture,
 )
+from sb3_flowpolicy.experiments.separate_seeds import SeparateSeeds
 from sb3_flowpolicy.experiments.store import ItemFiles, Row, read_json, write_json
 from sb3_flowpolicy.experiments.work import WorkItem, environment
 from sb3_flowpolicy.sac_flow import UPDATES_WORTH_COMPILING, SACFlow
@@ -95,12 +96,17 @@ class _Training:
         self.tests.close()
         self.files.finish(self._facts())
 
-    def _begin(self) -> SeedBatch:
+    def _begin(self) -> SeedBatch | SeparateSeeds:
         """Start over: what an interrupted run wrote before its first checkpoint goes."""
         self.files.cut_to({"table": 0, "details": 0})
         settings = {"device": "cpu", **self.item.hyperparameters}
         settings.setdefault("compile", self.item.updates >= UPDATES_WORTH_COMPILING)
-        return SeedBatch(
+        if self._one_by_one:
+            kind: type[SeedBatch | SeparateSeeds] = SeparateSeeds
+            settings["compile"] = False
+        else:
+            kind = SeedBatch
+        return kind(
             settings.pop("policy"),
             self.env,
             self.item.seeds,
@@ -109,10 +115,15 @@ class _Training:
             **settings,
         )
 
+    @property
+    def _one_by_one(self) -> bool:
+        """Whether this is gSDE, whose noise is in SB3's actor and not in a density."""
+        return bool(self.item.hyperparameters.get("use_sde"))
+
     def _infos(self) -> list[str]:
         return [name for name in TRAINING_INFOS if name in self.item.measures]
 
-    def _resume(self) -> SeedBatch | None:
+    def _resume(self) -> SeedBatch | SeparateSeeds | None:
         # Half-written checkpoints have another name, so the last of these is complete.
         found = sorted(self.files.checkpoints.glob("step_*"))
         if not found:
@@ -122,6 +133,8 @@ class _Training:
         self.done_steps = state["step"]
         self.seconds_before, self.cpu_before = state["seconds"], state["cpu_seconds"]
         self.sessions = state["sessions"] + 1
+        if self._one_by_one:
+            return SeparateSeeds.load(found[-1], self.env, self.item.seeds, self._infos())
         return SeedBatch.load(found[-1], self.env, info_keywords=self._infos())
 
     def _save(self) -> None:

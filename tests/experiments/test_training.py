@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from sb3_flowpolicy.experiments import training
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.training import run_item
-from sb3_flowpolicy.experiments.work import WorkItem, make_plan
+from sb3_flowpolicy.experiments.work import WorkItem, make_plan, merge
 
 
 @pytest.fixture
@@ -64,11 +66,17 @@ class Crash(BaseException):
     """Not an error that anybody would catch."""
 
 
-@pytest.mark.parametrize("crashes", [[0, 3], [1, 1, 2]])
+GSDE = {"policy": "GaussPolicy", "use_sde": True, "train_freq": 8, "gradient_steps": 8}
+
+
+@pytest.mark.parametrize(("crashes", "overrides"), [([0, 3], {}), ([1, 1, 2], {}), ([1, 2], GSDE)])
 def test_interrupted_runs_end_with_the_same_results(
-    crashes: list[int], item: WorkItem, tmp_path: Path
+    crashes: list[int], overrides: dict[str, Any], item: WorkItem, tmp_path: Path
 ) -> None:
     """A crash after so many reports of a session; half a line is left behind."""
+    hyperparameters = merge(item.hyperparameters, overrides)
+    measures = () if overrides else item.measures
+    item = replace(item, hyperparameters=hyperparameters, measures=measures)
     straight, folder = tmp_path / "straight", tmp_path / "interrupted"
     straight.mkdir()
     folder.mkdir()

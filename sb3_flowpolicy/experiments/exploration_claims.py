@@ -1,0 +1,92 @@
+"""Our own comparison: what else people would use when a diagonal Gaussian does not explore."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_flowpolicy.experiments.experiment import (
+    FLOW,
+    GAUSS,
+    LOW_RANK,
+    Agent,
+    Experiment,
+    Setting,
+)
+from sb3_flowpolicy.experiments.rules import at_least_times, solved
+
+_PINK = {"action_noise_color": 1.0}
+
+
+def _density(name: str) -> dict[str, Any]:
+    return {"policy_kwargs": {"distribution": name}}
+
+
+GAUSS_PINK = Agent("gauss-pink", "Gauss, pink noise", "sac_gauss", _PINK)
+# SB3 draws gSDE's noise once per rollout: with train_freq=1 it would be white.
+GSDE = Agent("gsde", "gSDE", "sac_gauss", {"use_sde": True, "train_freq": 8, "gradient_steps": 8})
+LATTICE = Agent("lattice", "Lattice", "sac_gauss", _density("lattice"))
+FULL_COVARIANCE = Agent(
+    "full-covariance", "full covariance", "sac_gauss", _density("full_covariance")
+)
+FLOW_PINK = Agent("flow-pink", "NF, pink noise", "sac_flow", _PINK)
+SPLINE = Agent("spline", "spline", "sac_flow", _density("spline"))
+SPLINE_PINK = Agent(
+    "spline-pink", "spline, pink noise", "sac_flow", {**_density("spline"), **_PINK}
+)
+
+EXPLORERS = (
+    GAUSS,
+    GAUSS_PINK,
+    GSDE,
+    LATTICE,
+    LOW_RANK,
+    FULL_COVARIANCE,
+    FLOW,
+    FLOW_PINK,
+    SPLINE,
+    SPLINE_PINK,
+)
+
+_DIMENSIONS = (2, 8)
+
+EXPLORATION_CLAIMS = (
+    Experiment(
+        name="exploration-benchmark",
+        claim="X1",
+        source="ours",
+        title="The diagonal tunnel for every way to explore: densities, gSDE, coloured noise",
+        thesis="Not in the thesis, which compares Gauss, LR and NF.",
+        settings=tuple(
+            Setting(
+                f"{count}-dimensions",
+                "TunnelDiagonal-v0",
+                env_kwargs={"total_dims": count, "coupled_dims": count},
+            )
+            for count in _DIMENSIONS
+        ),
+        agents=EXPLORERS,
+        checks=tuple(
+            solved(f"{count}-dimensions", agent, 0.9)
+            for count in _DIMENSIONS
+            for agent in EXPLORERS
+        ),
+        notes="Hyperparameters are those of sparse-fixed-alpha, for every agent. gSDE keeps its "
+        "noise for 8 steps and then does 8 updates, as is usual; all others update at every step. "
+        "There is no claim to reproduce: each line says whether that agent gets there.",
+    ),
+    Experiment(
+        name="exploration-benchmark-square",
+        claim="X2",
+        source="ours",
+        title="The square to move along x for every way to explore",
+        thesis="Not in the thesis, which compares Gauss, LR and NF.",
+        settings=(Setting("move-x", "SquareMoveX-v0"),),
+        agents=EXPLORERS,
+        checks=tuple(
+            at_least_times("move-x", "x_std", agent, GAUSS, 1.5) for agent in EXPLORERS[1:]
+        ),
+        steps=200_000,
+        eval_every=4000,
+        measures=("x_std", "x_max"),
+    ),
+)
