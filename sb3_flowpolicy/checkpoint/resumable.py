@@ -79,10 +79,15 @@ class Resumable(OffPolicyAlgorithm):
         check_same_build(self.env, checkpoint.manifest["layers"]["model"])
         archive = checkpoint.folder / "model.zip"
         _, parameters, variables = load_from_zip_file(archive, device=self.device)
-        self.set_parameters(parameters, device=self.device)
-        for name, value in (variables or {}).items():
-            if value is not None:
-                getattr(self, name).data.copy_(value.data)
+        try:
+            self.set_parameters(parameters, device=self.device)
+            for name, value in (variables or {}).items():
+                if value is not None:
+                    getattr(self, name).data.copy_(value.data)
+        except (AttributeError, KeyError, RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"model must be built with the settings of the run in {path}: {error}"
+            ) from error
         self._resumption = take_up(self._describe_run(), store, checkpoint)
         if self._last_obs is None:
             assert self.env is not None

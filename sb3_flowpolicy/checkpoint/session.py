@@ -181,6 +181,11 @@ def start_checkpoints(owner: Resumes, path: str | Path | None, every: int | None
         )
     if owner._checkpoints is None or owner._checkpoints.path.resolve() != Path(path).resolve():
         check_every(every)
+        if owner._checkpoints is not None and owner._checkpoints.active:
+            raise ValueError(
+                "checkpoint_path must be one folder for a call of learn(), got "
+                f"{owner._checkpoints.path} and {path}"
+            )
         owner._checkpoints = Checkpoints(owner._describe_run(), path, owner._resumption)
     else:
         owner._checkpoints.run = owner._describe_run()  # the environment may be another by now

@@ -158,6 +158,22 @@ def test_a_replay_buffer_of_another_size_is_refused(run: Path) -> None:
         model.learn(120, callback=RunCheckpointCallback(40, run, resume=True))
 
 
+@pytest.mark.parametrize(
+    "changes", [{"policy_kwargs": {"net_arch": [9]}}, {"ent_coef": 0.1}, {"policy": "GaussPolicy"}]
+)
+def test_a_model_with_other_settings_does_not_resume(changes: dict[str, Any], run: Path) -> None:
+    model = SACFlow(env=ENV, **{"policy": "FlowPolicy", **FAST, **changes})
+    with pytest.raises(ValueError, match="model must be built with the settings of the run in"):
+        model.learn(120, callback=RunCheckpointCallback(40, run, resume=True))
+
+
+def test_one_folder_at_a_time(tmp_path: Path) -> None:
+    model = SACFlow("FlowPolicy", ENV, **FAST)
+    callback = RunCheckpointCallback(10, tmp_path / "b")
+    with pytest.raises(ValueError, match=r"checkpoint_path must be one folder .* got .*a and .*b"):
+        model.learn(20, callback=callback, checkpoint_every=10, checkpoint_path=tmp_path / "a")
+
+
 def test_a_second_run_in_the_folder_goes_on_counting(tmp_path: Path) -> None:
     model = SACFlow("FlowPolicy", ENV, **FAST)
     model.learn(20, checkpoint_every=10, checkpoint_path=tmp_path)
