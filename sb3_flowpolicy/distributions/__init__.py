@@ -3,6 +3,7 @@
 from sb3_flowpolicy.distributions.base import ActionDistribution
 from sb3_flowpolicy.distributions.full_covariance import FullCovarianceGaussian
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+from sb3_flowpolicy.distributions.lattice import Lattice
 from sb3_flowpolicy.distributions.low_rank import LowRankGaussian
 from sb3_flowpolicy.distributions.realnvp import RealNVP
 from sb3_flowpolicy.distributions.registry import (
@@ -16,6 +17,7 @@ __all__ = [
     "ActionDistribution",
     "DiagGaussian",
     "FullCovarianceGaussian",
+    "Lattice",
     "LowRankGaussian",
     "RealNVP",
     "TanhSquashed",
