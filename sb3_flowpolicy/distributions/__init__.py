@@ -11,6 +11,7 @@ from sb3_flowpolicy.distributions.registry import (
     register_distribution,
     registered_distributions,
 )
+from sb3_flowpolicy.distributions.spline import Spline
 from sb3_flowpolicy.distributions.squashed import TanhSquashed
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "Lattice",
     "LowRankGaussian",
     "RealNVP",
+    "Spline",
     "TanhSquashed",
     "make_distribution",
     "register_distribution",

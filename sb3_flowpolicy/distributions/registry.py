@@ -11,6 +11,7 @@ from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 from sb3_flowpolicy.distributions.lattice import Lattice
 from sb3_flowpolicy.distributions.low_rank import LowRankGaussian
 from sb3_flowpolicy.distributions.realnvp import RealNVP
+from sb3_flowpolicy.distributions.spline import Spline
 
 _REGISTRY: dict[str, type[ActionDistribution]] = {
     "gaussian": DiagGaussian,
@@ -18,6 +19,7 @@ _REGISTRY: dict[str, type[ActionDistribution]] = {
     "full_covariance": FullCovarianceGaussian,
     "lattice": Lattice,
     "realnvp": RealNVP,
+    "spline": Spline,
 }
 
 
