@@ -103,10 +103,12 @@ def test_actions_are_those_of_predict(kind: str, form: str, tmp_path: Path) -> N
     action, sampled = run(path, ["action", "sampled_action"], feed)
     assert action.shape == (N, 2, 3)
     assert action.dtype == np.float32
+    # Where a spline is steep, it makes more of float32's rounding: here, relative to the range.
+    atol = 6 * onnx_export.TOLERANCE if kind == "spline" else 1e-5
     expected = model.predict(normalized, deterministic=True)[0]
-    np.testing.assert_allclose(action, expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(action, expected, rtol=0, atol=atol)
     th.manual_seed(3)
-    np.testing.assert_allclose(sampled, model.predict(normalized)[0], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(sampled, model.predict(normalized)[0], rtol=0, atol=atol)
     # Every part has a say, or the comparison would prove little.
     assert np.abs(expected.std(0)).min() > 1e-3
     assert np.abs(sampled - action).max() > 1e-2
