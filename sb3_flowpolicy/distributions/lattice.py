@@ -37,10 +37,11 @@ class Lattice(DiagGaussian):
     for its SAC; the scale alpha; one feature's noise on all actions at once. Different:
 
     - Standard deviations come from linear heads, as in the authors' variant without correlation in
-      time. Their main one has :math:`\sigma^2 = S^\top h^2`, with learned S, after gSDE, which
-      leaves no noise where h is zero.
-    - Their noise matrices are kept for some steps; here noise is drawn at every step. For noise
-      that correlates in time there is ``action_noise_color``, for this density as for any other.
+      time. Their main one is gSDE's, :math:`\sigma_i^2 = \sum_j S_{ji}^2 h_j^2` with learned S,
+      which leaves no noise where h is zero.
+    - They draw noise for every feature and action, and keep the matrices it comes from for a
+      number of steps. Here D normals are drawn, at every step. For noise that correlates in time
+      there is ``action_noise_color``, which then acts on the actions, not on single features.
     - Log standard deviations are bounded softly, :math:`\sigma \in (e^{-10}, e^2)`, not clipped.
       Nothing is added to the variance (their ``std_reg``), and the mean is not clipped.
     - For on-policy algorithms, too, features are learned through the standard deviations.
