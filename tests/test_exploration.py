@@ -22,11 +22,17 @@ FAST: dict[str, Any] = {
     "seed": 0,
     "learning_starts": 10_000,
 }
-POLICIES = pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+# Of densities without a policy class of their own, the names.
+POLICIES = pytest.mark.parametrize(
+    "policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", "lattice", "spline"]
+)
 
 
 def fixed_state(policy: str, n_envs: int = 1, **kwargs: Any) -> SACFlow:
     """A model about to act, at one state, with weights off their initial values."""
+    if not policy.endswith("Policy"):
+        kwargs["policy_kwargs"] = {**FAST["policy_kwargs"], "distribution": policy}
+        policy = "FlowPolicy"
     model = SACFlow(policy, make_vec_env("TunnelDiagonal-v0", n_envs), **(FAST | kwargs))
     th.manual_seed(1)
     with th.no_grad():

@@ -117,7 +117,7 @@ def score_standard_normal(point: th.Tensor) -> th.Tensor:
     return standard_normal_log_prob(point.clamp(-FARTHEST, FARTHEST))
 
 
-def soft_bound(value: th.Tensor, bound: float) -> th.Tensor:
+def soft_bound(value: th.Tensor, bound: float | th.Tensor) -> th.Tensor:
     r"""Squeeze into (-bound, bound) by :math:`x / (1 + |x| / b)`.
 
     The slope is 1 at zero and never vanishes, so that, unlike a clip, a value that has run

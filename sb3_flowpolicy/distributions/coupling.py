@@ -1,9 +1,10 @@
-"""Affine couplings: the invertible layers that RealNVP is made of."""
+"""Couplings: the invertible layers that flows are made of, affine ones and what others share."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import cast
 
@@ -17,12 +18,48 @@ from sb3_flowpolicy.distributions.base import soft_bound
 LOG_SCALE_BOUND = 5.0
 
 
-class AffineCoupling(nn.Module):
-    r"""Network that reads one half a of the coordinates and moves the other half b.
+class Coupling(nn.Module, ABC):
+    r"""Network that reads one half a of the coordinates and says how to move the other half b.
 
-    .. math:: b \mapsto b \odot \exp(s(a, h)) + t(a, h)
+    .. math:: b \mapsto g(b; \mathrm{network}(a, h))
 
     The part of its first layer that reads h is computed by the caller, for all layers at once.
+
+    Args:
+        passive: Number of coordinates that are read, 0 or more.
+        outputs: Number of outputs of the network.
+        hidden: Units of the hidden layers.
+    """
+
+    def __init__(self, passive: int, outputs: int, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.passive = passive
+        self.first = nn.Linear(passive, hidden[0], bias=False) if passive else None
+        layers: list[nn.Module] = [nn.ReLU()]
+        for n_in, n_out in pairwise(hidden):
+            layers += [nn.Linear(n_in, n_out), nn.ReLU()]
+        self.between = nn.Sequential(*layers)
+        self.last = nn.Linear(hidden[-1], outputs)
+
+    def forward(self, passive: th.Tensor, projected: th.Tensor) -> th.Tensor:
+        """Return what decides how b is moved, (..., outputs); zeros mean that it stays."""
+        if self.first is not None:
+            projected = projected + self.first(passive)
+        return self.last(self.between(projected))
+
+    @abstractmethod
+    def move(self, active: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return g(b) and log|g'(b)|, both (..., active)."""
+
+    @abstractmethod
+    def move_back(self, moved: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Undo :meth:`move`: return b and log|g'(b)|, as there."""
+
+
+class AffineCoupling(Coupling):
+    r"""Coupling that scales and shifts.
+
+    .. math:: b \mapsto b \odot \exp(s(a, h)) + t(a, h)
 
     Args:
         passive: Number of coordinates that are read, 0 or more.
@@ -34,21 +71,19 @@ class AffineCoupling(nn.Module):
     """
 
     def __init__(self, passive: int, active: int, hidden: Sequence[int]) -> None:
-        super().__init__()
-        self.passive = passive
-        self.first = nn.Linear(passive, hidden[0], bias=False) if passive else None
-        layers: list[nn.Module] = [nn.ReLU()]
-        for n_in, n_out in pairwise(hidden):
-            layers += [nn.Linear(n_in, n_out), nn.ReLU()]
-        self.between = nn.Sequential(*layers)
-        self.last = nn.Linear(hidden[-1], 2 * active)
+        super().__init__(passive, 2 * active, hidden)
 
-    def forward(self, passive: th.Tensor, projected: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return shift t and log-scale s, both (..., active)."""
-        if self.first is not None:
-            projected = projected + self.first(passive)
-        shift, log_scale = self.last(self.between(projected)).chunk(2, dim=-1)
-        return shift, soft_bound(log_scale, LOG_SCALE_BOUND)
+    def move(self, active: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Scale, then shift."""
+        shift, log_scale = outputs.chunk(2, dim=-1)
+        log_scale = soft_bound(log_scale, LOG_SCALE_BOUND)
+        return active * log_scale.exp() + shift, log_scale
+
+    def move_back(self, moved: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Shift back, then scale back."""
+        shift, log_scale = outputs.chunk(2, dim=-1)
+        log_scale = soft_bound(log_scale, LOG_SCALE_BOUND)
+        return (moved - shift) * (-log_scale).exp(), log_scale
 
 
 class CouplingPair(nn.Module):
@@ -57,14 +92,16 @@ class CouplingPair(nn.Module):
     Args:
         features: Number of coordinates D, at least 1.
         index: Position in the flow, from 0; decides the split (see :func:`split_order`).
-        hidden: Units of the hidden layers of each coupling.
+        make: Builds a coupling, given the numbers of coordinates that it reads and moves.
         couplings: 2, or 1 where the flow's length is odd or D = 1.
     """
 
     order: th.Tensor
     back: th.Tensor
 
-    def __init__(self, features: int, index: int, hidden: Sequence[int], couplings: int) -> None:
+    def __init__(
+        self, features: int, index: int, make: Callable[[int, int], Coupling], couplings: int
+    ) -> None:
         super().__init__()
         order, n_first = split_order(features, index)
         # Two dimensions need no gather: it would only slow the hot path.
@@ -72,10 +109,8 @@ class CouplingPair(nn.Module):
         self.sizes = [n_first, features - n_first]
         self.register_buffer("order", th.tensor(order), persistent=False)
         self.register_buffer("back", th.tensor(order).argsort(), persistent=False)
-        modules = nn.ModuleList(
-            AffineCoupling(self.sizes[i], self.sizes[1 - i], hidden) for i in range(couplings)
-        )
-        self.couplings = cast("Sequence[AffineCoupling]", modules)  # ModuleList is not generic
+        modules = nn.ModuleList(make(self.sizes[i], self.sizes[1 - i]) for i in range(couplings))
+        self.couplings = cast("Sequence[Coupling]", modules)  # ModuleList is not generic
 
     def forward(
         self, value: th.Tensor, projected: Sequence[th.Tensor]
@@ -83,9 +118,9 @@ class CouplingPair(nn.Module):
         """Map base to action side: (..., D) -> (..., D) and log|det J|, shape (...)."""
         halves, ladj = self._split(value), value.new_zeros(())
         for i, coupling in enumerate(self.couplings):
-            shift, log_scale = coupling(halves[i], projected[i])
-            halves[1 - i] = halves[1 - i] * log_scale.exp() + shift
-            ladj = ladj + log_scale.sum(-1)
+            outputs = coupling(halves[i], projected[i])
+            halves[1 - i], ladjs = coupling.move(halves[1 - i], outputs)
+            ladj = ladj + ladjs.sum(-1)
         return self._merge(halves), ladj
 
     def inverse(
@@ -94,9 +129,9 @@ class CouplingPair(nn.Module):
         """Undo :meth:`forward`; the log-determinant returned is that of :meth:`forward`."""
         halves, ladj = self._split(value), value.new_zeros(())
         for i, coupling in reversed(list(enumerate(self.couplings))):
-            shift, log_scale = coupling(halves[i], projected[i])
-            halves[1 - i] = (halves[1 - i] - shift) * (-log_scale).exp()
-            ladj = ladj + log_scale.sum(-1)
+            outputs = coupling(halves[i], projected[i])
+            halves[1 - i], ladjs = coupling.move_back(halves[1 - i], outputs)
+            ladj = ladj + ladjs.sum(-1)
         return self._merge(halves), ladj
 
     def _split(self, value: th.Tensor) -> list[th.Tensor]:

@@ -8,14 +8,18 @@ from typing import Any
 from sb3_flowpolicy.distributions.base import ActionDistribution
 from sb3_flowpolicy.distributions.full_covariance import FullCovarianceGaussian
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+from sb3_flowpolicy.distributions.lattice import Lattice
 from sb3_flowpolicy.distributions.low_rank import LowRankGaussian
 from sb3_flowpolicy.distributions.realnvp import RealNVP
+from sb3_flowpolicy.distributions.spline import Spline
 
 _REGISTRY: dict[str, type[ActionDistribution]] = {
     "gaussian": DiagGaussian,
     "low_rank": LowRankGaussian,
     "full_covariance": FullCovarianceGaussian,
+    "lattice": Lattice,
     "realnvp": RealNVP,
+    "spline": Spline,
 }
 
 

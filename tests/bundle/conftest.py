@@ -24,7 +24,12 @@ FAST: dict[str, Any] = {
     "device": "cpu",
 }
 NET = {"net_arch": [16, 16]}
-UNUSUAL = {"realnvp": {"layers": 3, "hidden": [6]}, "low_rank": {"rank": 1}}
+UNUSUAL: dict[str, dict[str, Any]] = {
+    "realnvp": {"layers": 3, "hidden": [6]},
+    "low_rank": {"rank": 1},
+    "lattice": {"alpha": 0.5},
+    "spline": {"layers": 2, "bins": 5},
+}
 
 
 def multi_env() -> Any:

@@ -24,7 +24,7 @@ from sb3_flowpolicy.sac_flow import _SAC_ARGUMENTS
 from sb3_flowpolicy.settings import SETTINGS
 from tests.bundle.conftest import FAST, NET, UNUSUAL, behind_statistics, make_model, multi_env
 
-OURS = ["gaussian", "low_rank", "full_covariance", "realnvp"]
+OURS = ["gaussian", "low_rank", "full_covariance", "lattice", "realnvp", "spline"]
 CASES: dict[str, Any] = {
     **{name: lambda name=name: make_model(policy_kwargs=density(name)) for name in OURS},
     "one_critic_sgd": lambda: make_model(

@@ -20,6 +20,8 @@ from sb3_flowpolicy.engine.update import Batch
 
 N_UPDATES = 20
 BATCH_SIZE = 32
+# Densities that have no policy class of their own: in place of one, their name.
+WITHOUT_POLICY = ["lattice", "spline"]
 
 
 class DoubleExtractor(FlattenExtractor):
@@ -40,6 +42,8 @@ def make(algorithm: type[SAC], policy: str, dtype: th.dtype, seed: int = 0, **se
     policy_kwargs = {"net_arch": [16, 16], **settings.pop("policy_kwargs", {})}
     if dtype == th.float64:
         policy_kwargs["features_extractor_class"] = DoubleExtractor
+    if policy in WITHOUT_POLICY:
+        policy, policy_kwargs["distribution"] = "FlowPolicy", policy
     if algorithm is SAC:
         policy = SACFlow.policy_aliases[policy] if policy != "MlpPolicy" else policy  # type: ignore[assignment]
     model = algorithm(
@@ -113,8 +117,8 @@ def check_equal_to_sb3(
 ) -> None:
     """For "MlpPolicy" the peer is untouched SB3, for the others SB3's loop with our policy."""
     ours_policy = "GaussPolicy" if policy == "MlpPolicy" else policy
-    optimizer_kwargs = {"weight_decay": weight_decay}
-    settings = {"ent_coef": ent_coef, "policy_kwargs": {"optimizer_kwargs": optimizer_kwargs}}
+    policy_kwargs: dict[str, Any] = {"optimizer_kwargs": {"weight_decay": weight_decay}}
+    settings = {"ent_coef": ent_coef, "policy_kwargs": policy_kwargs}
     stock = make(SAC, policy, dtype, **settings)
     ours = make(SACFlow, ours_policy, dtype, compile=compile, **settings)
     ours.policy.load_state_dict(stock.policy.state_dict())
@@ -132,7 +136,7 @@ def check_equal_to_sb3(
 @pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("ent_coef", [0.1, "auto"])
 @pytest.mark.parametrize("weight_decay", [0.0, 2.5e-4])
-@pytest.mark.parametrize("policy", ["MlpPolicy", "LowRankPolicy", "FlowPolicy"])
+@pytest.mark.parametrize("policy", ["MlpPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY])
 def test_eager_engine_equals_sb3(
     policy: str, weight_decay: float, ent_coef: Any, dtype: th.dtype
 ) -> None:
@@ -149,7 +153,7 @@ COMPILED = [
 MATRIX = [
     pytest.param(*case, marks=[] if case in COMPILED else pytest.mark.slow)
     for case in itertools.product(
-        ["MlpPolicy", "LowRankPolicy", "FlowPolicy"],
+        ["MlpPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY],
         [0.0, 2.5e-4],
         [0.1, "auto"],
         [th.float32, th.float64],
@@ -164,7 +168,7 @@ def test_compiled_engine_equals_sb3(
     check_equal_to_sb3(policy, weight_decay, ent_coef, dtype, compile=True)
 
 
-@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY])
 @pytest.mark.parametrize("ent_coef", [0.1, "auto"])
 @pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
 def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th.dtype) -> None:
@@ -189,7 +193,7 @@ def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th
         assert_close(everything(got), everything(single.models[0]), dtype)
 
 
-@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY])
 def test_autocast_rounds_products_and_nothing_else(policy: str) -> None:
     exact, rounded = (make(SACFlow, policy, th.float32, autocast=on) for on in (False, True))
     rounded.policy.load_state_dict(exact.policy.state_dict())

@@ -97,6 +97,7 @@ def test_constructor(arguments: dict[str, Any]) -> None:
 
 
 PENDULUM = gym.make("Pendulum-v1")
+DENSITIES = ["gaussian", "low_rank", "full_covariance", "lattice", "realnvp", "spline"]
 KWARGS = ["distribution", "distribution_kwargs", "net_arch"]
 
 
@@ -113,9 +114,11 @@ def test_policy_kwargs(policy: Any, kwargs: dict[str, Any]) -> None:
 
 @fuzz(250)
 @given(
-    distribution=st.sampled_from(["realnvp", "low_rank", "gaussian", "full_covariance"]),
+    distribution=st.sampled_from(DENSITIES),
     arguments=st.dictionaries(
-        st.sampled_from(["layers", "hidden", "init", "rank", "x"]), ANYTHING, max_size=2
+        st.sampled_from(["layers", "hidden", "init", "bins", "rank", "alpha", "x"]),
+        ANYTHING,
+        max_size=2,
     ),
 )
 def test_distribution_kwargs(distribution: str, arguments: dict[str, Any]) -> None:

@@ -55,7 +55,9 @@ def test_edge_of_the_box_has_finite_density(actor: FlowActor) -> None:
 
 # Densities whose tails end within the grid.
 @pytest.mark.parametrize(
-    "actor", ["gaussian", "low_rank", "full_covariance", "realnvp"], indirect=True
+    "actor",
+    ["gaussian", "low_rank", "full_covariance", "lattice", "realnvp", "spline"],
+    indirect=True,
 )
 def test_entropy_is_minus_the_mean_log_prob_on_a_grid(actor: FlowActor) -> None:
     obs = th.randn(1, 3)

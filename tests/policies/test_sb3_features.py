@@ -186,6 +186,8 @@ def test_policy_aliases_name_their_class() -> None:
 UNUSUAL: dict[str, dict] = {
     "realnvp": {"layers": 3, "hidden": [6, 5], "init": "default"},
     "low_rank": {"rank": 1},
+    "lattice": {"alpha": 0.5},
+    "spline": {"layers": 3, "hidden": [6, 5], "init": "default", "bins": 5},
 }
 IN_A_NEW_PROCESS = """
 import sys, json, numpy as np, torch as th

@@ -1,0 +1,125 @@
+"""Normal distribution that correlates actions as the policy's own last layer does (Lattice)."""
+
+from __future__ import annotations
+
+import math
+
+import torch as th
+from torch import nn
+
+from sb3_flowpolicy.distributions.base import (
+    FARTHEST,
+    score_standard_normal,
+    soft_bound,
+    standard_normal_log_prob,
+)
+from sb3_flowpolicy.distributions.gaussian import DiagGaussian
+
+# Actions steadier than e^-10 = 0.00005 are as good as deterministic, and keep float64's digits
+# for the covariance's Cholesky factor. The upper bound is SB3's.
+LOG_STD_MIN = -10.0
+LOG_STD_MAX = 2.0
+
+
+class Lattice(DiagGaussian):
+    r"""Normal distribution made of noise in the features and of noise in the actions.
+
+    .. math:: u = W (h + \alpha \sigma_h(h) \odot \epsilon_h) + b + \sigma_a(h) \odot \epsilon_a
+        \;\sim\; \mathcal N \left( W h + b, \;
+        \alpha^2 W \mathrm{diag}(\sigma_h^2) W^\top + \mathrm{diag}(\sigma_a^2) \right)
+
+    W is the layer that computes the mean, so actions that the policy moves together are explored
+    together. Of this distribution, D normals are a sample: :math:`u = W h + b + L \epsilon` with
+    the covariance's Cholesky factor L, computed in float64. No pivot of it can be less than
+    :math:`\sigma_a^2`, and none is let fall below: no failure, no NaN.
+
+    The same as in the paper: the covariance, with the mean's W in it and gradients through it, as
+    for its SAC; the scale alpha; one feature's noise on all actions at once. Different:
+
+    - Standard deviations come from linear heads, as in the authors' variant without correlation in
+      time. Their main one is gSDE's, :math:`\sigma_i^2 = \sum_j S_{ji}^2 h_j^2` with learned S,
+      which leaves no noise where h is zero.
+    - They draw noise for every feature and action, and keep the matrices it comes from for a
+      number of steps. Here D normals are drawn, at every step. For noise that correlates in time
+      there is ``action_noise_color``, which then acts on the actions, not on single features.
+    - Log standard deviations are bounded softly, :math:`\sigma \in (e^{-10}, e^2)`, not clipped.
+      Nothing is added to the variance (their ``std_reg``), and the mean is not clipped.
+    - For on-policy algorithms, too, features are learned through the standard deviations.
+
+    Args:
+        action_dim: Number of action dimensions D, at least 1.
+        context_dim: Number of context features H, at least 1.
+        alpha: Scale of the features' noise, 0 or more; 0 leaves a diagonal covariance.
+
+    Raises:
+        ValueError: If ``alpha`` is negative or not finite.
+
+    References:
+        Latent Exploration for Reinforcement Learning (Chiappa et al., 2023).
+
+    Example:
+        >>> import torch as th
+        >>> _ = th.manual_seed(0)
+        >>> density = Lattice(action_dim=2, context_dim=16)
+        >>> u, log_prob = density.rsample_and_log_prob(th.zeros(5, 16), th.randn(5, 2))
+        >>> th.allclose(log_prob, density.log_prob(th.zeros(5, 16), u), atol=1e-4)
+        True
+    """
+
+    def __init__(self, action_dim: int, context_dim: int, alpha: float = 1.0) -> None:
+        super().__init__(action_dim, context_dim)
+        is_number = isinstance(alpha, int | float) and not isinstance(alpha, bool)
+        if not is_number or not 0 <= alpha < math.inf:
+            raise ValueError(f"alpha must be a finite number >= 0, got {alpha!r}")
+        self.alpha = float(alpha)
+        self.latent_log_std = nn.Linear(context_dim, context_dim)
+
+    def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the mean and the log standard deviation of the actions' own noise, (..., D)."""
+        return self.mu(context), _bounded(self.log_std(context))
+
+    def scale_tril(self, context: th.Tensor, log_std: th.Tensor) -> th.Tensor:
+        """Return the Cholesky factor of the covariance, shape (..., D, D), in float64.
+
+        Args:
+            context: Features h, shape (..., H).
+            log_std: Log standard deviation of the actions' own noise, shape (..., D).
+        """
+        latent_variance = (2 * _bounded(self.latent_log_std(context)).double()).exp()
+        weight = self.alpha * self.mu.weight.double()
+        # Products of W's rows, one per entry of the covariance: a single matrix product for all.
+        pairs = (weight.unsqueeze(0) * weight.unsqueeze(1)).flatten(0, 1)
+        rest = (latent_variance @ pairs.mT).unflatten(-1, (self.action_dim, self.action_dim))
+        variance = (2 * log_std.double()).exp()
+        rest = rest + variance.unsqueeze(-1) * th.eye(self.action_dim).to(rest)
+        columns = []
+        for i in range(self.action_dim):
+            pivot = th.maximum(rest[..., :1, 0], variance[..., i : i + 1]).sqrt()
+            below = rest[..., 1:, 0] / pivot
+            columns.append(nn.functional.pad(th.cat([pivot, below], dim=-1), (i, 0)))
+            rest = rest[..., 1:, 1:] - below.unsqueeze(-1) * below.unsqueeze(-2)
+        return th.stack(columns, dim=-1)
+
+    def _rsample_and_log_prob(
+        self, context: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        loc, log_std = self.loc_and_log_std(context)
+        lower = self.scale_tril(context, log_std)
+        sample = loc + (lower * noise.double().unsqueeze(-2)).sum(-1).to(noise)
+        return sample, standard_normal_log_prob(noise) - _half_log_det(lower).to(noise)
+
+    def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
+        loc, log_std = self.loc_and_log_std(context)
+        lower = self.scale_tril(context, log_std)
+        distance = (value - loc).double().clamp(-FARTHEST, FARTHEST)
+        noise = th.linalg.solve_triangular(lower, distance.unsqueeze(-1), upper=False).squeeze(-1)
+        return (score_standard_normal(noise) - _half_log_det(lower)).to(value)
+
+
+def _bounded(log_std: th.Tensor) -> th.Tensor:
+    """Squeeze into (LOG_STD_MIN, LOG_STD_MAX), slope 1 at zero."""
+    return soft_bound(log_std, th.where(log_std > 0, LOG_STD_MAX, -LOG_STD_MIN))
+
+
+def _half_log_det(lower: th.Tensor) -> th.Tensor:
+    return lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
