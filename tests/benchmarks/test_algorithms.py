@@ -41,8 +41,6 @@ def test_runs_are_written_down_and_not_repeated(
     assert "| tunnel-2 | ppo | flow |" in capsys.readouterr().out
     trained = []
     train = algorithms.train
-    monkeypatch.setattr(
-        algorithms, "train", lambda *run: trained.append(run[1:3]) or train(*run)
-    )
+    monkeypatch.setattr(algorithms, "train", lambda *run: trained.append(run[1:3]) or train(*run))
     algorithms.main([*command, "--algorithms", "ppo", "crossq", "--policies", "stock", "flow"])
     assert trained == [("crossq", "stock"), ("crossq", "flow")]
