@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+import inspect
+from typing import Any, ClassVar
 
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3.common.policies import BasePolicy
@@ -10,9 +11,23 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_flowpolicy.checkpoint import Resumable
 from sb3_flowpolicy.exploration import ColoredExploration
 from sb3_flowpolicy.policies import contrib as policies
+from sb3_flowpolicy.settings import check_settings
 
 
-class TQCFlow(Resumable, ColoredExploration, TQC):
+class _Checked(Resumable, ColoredExploration):
+    """Says what is wrong with arguments, as SACFlow does."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        theirs = next(base for base in type(self).__mro__ if base in (TQC, CrossQ))
+        names = list(inspect.signature(theirs).parameters)
+        check_settings({**dict(zip(names, args, strict=False)), **kwargs})
+        try:
+            super().__init__(*args, **kwargs)
+        except AssertionError as error:  # how SB3 refuses an environment
+            raise ValueError(str(error)) from error
+
+
+class TQCFlow(_Checked, TQC):
     """Truncated Quantile Critics with action distributions that correlate and bend.
 
     Everything of sb3-contrib's :class:`~sb3_contrib.TQC` holds. Besides, ``action_noise_color`` and
@@ -27,6 +42,10 @@ class TQCFlow(Resumable, ColoredExploration, TQC):
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of TQC, in its order.
         **kwargs: Keyword arguments of TQC and of ``ColoredExploration``.
+
+    Raises:
+        ValueError: If an argument is out of range, or the environment's action space is no Box with
+            finite bounds.
 
     References:
         Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile
@@ -53,7 +72,7 @@ class TQCFlow(Resumable, ColoredExploration, TQC):
     }
 
 
-class CrossQFlow(Resumable, ColoredExploration, CrossQ):
+class CrossQFlow(_Checked, CrossQ):
     """CrossQ with action distributions that correlate and bend.
 
     Everything of sb3-contrib's :class:`~sb3_contrib.CrossQ` holds, and what :class:`TQCFlow` adds.
@@ -65,6 +84,10 @@ class CrossQFlow(Resumable, ColoredExploration, CrossQ):
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of CrossQ, in its order.
         **kwargs: Keyword arguments of CrossQ and of ``ColoredExploration``.
+
+    Raises:
+        ValueError: If an argument is out of range, or the environment's action space is no Box with
+            finite bounds.
 
     References:
         CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_flowpolicy.noise_process import NoiseProcess, check_color
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.policies.off_policy import check_finite_actions
+from sb3_flowpolicy.vec_env import BatchedVecEnv
 
 
 class ColoredExploration(OffPolicyAlgorithm):
@@ -56,48 +57,57 @@ class ColoredExploration(OffPolicyAlgorithm):
         self._noise_process: NoiseProcess | None = None
         super().__init__(*args, **kwargs)
 
-    def make_noise_process(self, n_envs: int, env: Any) -> NoiseProcess | None:
-        """Return a new process that fits the policy and the episodes; None for white noise.
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.fit_noise_process(None, self.n_envs, self.env)  # raises what is wrong with it
+
+    def fit_noise_process(
+        self, process: NoiseProcess | None, n_envs: int, env: Any
+    ) -> NoiseProcess | None:
+        """Return a process of the present settings; None for white noise.
 
         Args:
+            process: One that was used so far; returned if it still fits.
             n_envs: Number of environments.
             env: What steps them, for the length of its episodes.
+
+        Raises:
+            ValueError: If settings are out of range, or the policy has no density of ours.
         """
-        if self.action_noise_color == 0 and self.action_noise_correlation_time is None:
+        color, correlation_time = self.action_noise_color, self.action_noise_correlation_time
+        check_color(color, correlation_time, "action_noise_")
+        if color == 0 and correlation_time is None:
             return None
         actor = self.policy.actor
         if not isinstance(actor, FlowActor):
             raise ValueError(
                 "action_noise_color must be 0 unless the policy is one of sb3_flowpolicy's with "
-                f"use_sde=False, got {self.action_noise_color} with {type(actor).__name__}"
+                f"use_sde=False, got {color} with {type(actor).__name__}"
             )
-        return NoiseProcess(
-            actor.density.noise_dim,
-            n_envs,
-            self.action_noise_color,
-            self.action_noise_correlation_time,
-            horizon=_episode_length(env),
+        new = NoiseProcess(
+            actor.density.noise_dim, n_envs, color, correlation_time, _episode_length(env)
         )
+        return process if process is not None and process.settings == new.settings else new
 
-    def _exploration_noise(self, n_envs: int) -> th.Tensor | None:
+    def _exploration_noise(self) -> th.Tensor | None:
         """Return the next noise (N, M) to act with; None where it is white."""
         process = self._noise_process
-        if process is None or process.white_shape[0] != n_envs:
-            process = self._noise_process = self.make_noise_process(n_envs, self.env)
         return None if process is None else process.step(th.randn(process.white_shape))
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         before = self._last_obs
         found = super()._setup_learn(*args, **kwargs)
-        if self._noise_process is not None and self._last_obs is not before:
-            self._noise_process.restart()  # environments were reset
+        process = self.fit_noise_process(self._noise_process, self.n_envs, self.env)
+        if process is not None and self._last_obs is not before:
+            process.restart()  # environments were reset
+        self._noise_process = process
         return found
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         warms_up = self.num_timesteps < learning_starts
-        noise = None if warms_up else self._exploration_noise(n_envs)
+        noise = None if warms_up else self._exploration_noise()
         if noise is None:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         # As SB3, only that the noise is given.
@@ -135,6 +145,12 @@ class ColoredExploration(OffPolicyAlgorithm):
 
 def _episode_length(env: Any) -> int | None:
     """Return after how many steps episodes are cut, None where nobody says."""
-    specs = env.get_attr("spec") if isinstance(env, VecEnv) else [getattr(env, "spec", None)]
-    steps = getattr(specs[0], "max_episode_steps", None) if specs else None
+    steps = None
+    if not isinstance(env, VecEnv):
+        steps = getattr(getattr(env, "spec", None), "max_episode_steps", None)
+    # gymnasium's TimeLimit. A spec may hold what cannot be sent from another process.
+    elif env.has_attr("_max_episode_steps"):
+        steps = env.get_attr("_max_episode_steps")[0]
+    elif isinstance(env.unwrapped, BatchedVecEnv):
+        steps = getattr(env.get_attr("spec")[0], "max_episode_steps", None)
     return steps if steps is None or steps >= 2 else None

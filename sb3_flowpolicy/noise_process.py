@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from functools import lru_cache
 
 import numpy as np
@@ -58,6 +59,8 @@ class NoiseProcess:
         horizon = DEFAULT_HORIZON if horizon is None else horizon
         if horizon < 2:
             raise ValueError(f"horizon must be at least 2 steps, got {horizon}")
+        #: What it was made of: two processes with the same settings have the same distribution.
+        self.settings = (noise_dim, n_envs, color, correlation_time, horizon)
         if correlation_time is not None:
             decays, shares = np.array([math.exp(-1 / correlation_time)]), np.ones(1)
         elif color == 0:
@@ -130,7 +133,7 @@ def check_color(color: float, correlation_time: float | None, prefix: str = "") 
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 @lru_cache(maxsize=8)

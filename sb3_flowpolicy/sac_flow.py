@@ -219,7 +219,7 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             return super()._sample_action(random_steps, action_noise, n_envs)
         # What SB3 does, less what it spends on finding out that the observation is an array.
         obs = th.as_tensor(self._last_obs, device=self.device)
-        noise = self._exploration_noise(n_envs)
+        noise = self._exploration_noise()
         if noise is not None:
             noise = noise.to(engine.networks.actor.data).unsqueeze(0)
         scaled = engine.act(obs.unsqueeze(0), noise).squeeze(0).cpu().numpy()

@@ -23,6 +23,7 @@ from sb3_flowpolicy.engine import LOSSES, Engine, settings_key
 from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
 from sb3_flowpolicy.finite import check_experience
 from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.noise_process import NoiseProcess
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.sac_flow import SACFlow
 from sb3_flowpolicy.seed_episodes import SeedEpisodes
@@ -109,22 +110,33 @@ class SeedBatch(BatchOnDisk):
         self._losses: list[list[float]] | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
-        self._noise = self._make_noise()
+        self._process: NoiseProcess | None = None
+        self._noise: dict[str, SeedNoise] = {}
+        self._fit_noise()
 
     def _buffers(self) -> list[ReplayBuffer]:
         return [model.replay_buffer for model in self._models if model.replay_buffer is not None]
 
-    def _make_noise(self) -> dict[str, SeedNoise]:
-        first = self._models[0]
+    def _fit_noise(self) -> None:
+        """Make random numbers fit the agents' settings; those that do already go on."""
+        first, before = self._models[0], self._noise
         assert isinstance(first.actor, FlowActor)
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
-        self._process = process = first.make_noise_process(len(self.seeds), self._venv)
+        process = first.fit_noise_process(self._process, len(self.seeds), self._venv)
         white_shape = (1, noise_dim) if process is None else process.white_shape[1:]
-        return {
-            "random actions": SeedNoise(self.seeds, shape, 0, uniform=True),
-            "actions": SeedNoise(self.seeds, white_shape, 1),
-            "updates": SeedNoise(self.seeds, (2, first.batch_size, noise_dim), 2),
-            "rows": SeedNoise(self.seeds, (first.batch_size,), 3, uniform=True),
+        # Name -> shape, and whether it is uniform.
+        wanted = {
+            "random actions": (shape, True),
+            "actions": (white_shape, False),
+            "updates": ((2, first.batch_size, noise_dim), False),
+            "rows": ((first.batch_size,), True),
+        }
+        self._process = process
+        self._noise = {
+            name: before[name]
+            if name in before and before[name].shape == needed
+            else SeedNoise(self.seeds, needed, stream, uniform)
+            for stream, (name, (needed, uniform)) in enumerate(wanted.items())
         }
 
     @property
@@ -284,8 +296,7 @@ class SeedBatch(BatchOnDisk):
         if not self._storage.rows.holds(buffers):
             self._storage = SeedStorage(buffers)
         self._storage.synchronize()
-        if self._noise["rows"].shape != (first.batch_size,):
-            self._noise = self._make_noise()
+        self._fit_noise()
 
     def _step(self, callbacks: list[BaseCallback], log_interval: int | None) -> bool:
         """Step all environments once; return whether to go on."""

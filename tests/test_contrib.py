@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3.common.callbacks import BaseCallback
 
 import flowpolicy_envs  # noqa: F401, registers the environments
@@ -95,3 +96,28 @@ def test_names_of_policies(algorithm: Any) -> None:
 def test_on_policy_algorithms_have_no_coloured_noise() -> None:
     with pytest.raises(ValueError, match=r"off-policy algorithms: .* got {'action_noise_color': 1"):
         PPOFlow("FlowPolicy", ENV, action_noise_color=1.0)
+
+
+@OFF_POLICY
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"gamma": "high"}, "gamma must be a number, got 'high'"),
+        ({"batch_size": 0}, "batch_size must be an integer of at least 1, got 0"),
+        ({"ent_coef": "aut"}, 'ent_coef must be a number, "auto"'),
+        ({"action_noise_color": 2.0}, "action_noise_color must be"),
+        ({"policy": "stock", "action_noise_color": 1.0}, "one of sb3_flowpolicy's"),
+    ],
+)
+def test_bad_arguments(algorithm: Any, arguments: dict[str, Any], message: str) -> None:
+    if arguments.get("policy") == "stock":
+        theirs = TQC if algorithm is TQCFlow else CrossQ
+        arguments = {**arguments, "policy": theirs.policy_aliases["MlpPolicy"]}
+    with pytest.raises(ValueError, match=message):
+        make(algorithm, **arguments)
+
+
+@OFF_POLICY
+def test_other_action_spaces(algorithm: Any) -> None:
+    with pytest.raises(ValueError, match="Discrete"):
+        algorithm("FlowPolicy", "CartPole-v1")

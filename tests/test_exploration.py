@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.envs.classic_control import PendulumEnv as Pendulum
 from scipy import signal, stats
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow, SeedBatch
@@ -200,8 +203,70 @@ def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
 
 
 def test_gsde_has_noise_of_its_own() -> None:
-    model = SACFlow(
-        "GaussPolicy", "Pendulum-v1", use_sde=True, action_noise_color=1.0, learning_starts=0
-    )
     with pytest.raises(ValueError, match="action_noise_color must be 0 unless the policy is one"):
-        model.learn(5)
+        SACFlow("GaussPolicy", "Pendulum-v1", use_sde=True, action_noise_color=1.0)
+
+
+def decays(model: SACFlow) -> int:
+    """Number of the process's components: it tells processes of different settings apart."""
+    assert model._noise_process is not None
+    return model._noise_process.white_shape[1]
+
+
+def test_settings_that_change_change_the_process(tmp_path: Path) -> None:
+    model = SACFlow("GaussPolicy", "TunnelDiagonal-v0", **FAST, action_noise_color=1.0).learn(12)
+    first, pink = model._noise_process, decays(model)
+    model.learn(4, reset_num_timesteps=False)
+    assert model._noise_process is first
+    model.set_env(gym.make("TunnelDiagonal-v0", max_episode_steps=4000))
+    model.learn(4, reset_num_timesteps=False)
+    assert decays(model) > pink
+    model.action_noise_color = 0.0
+    model.learn(4, reset_num_timesteps=False)
+    assert model._noise_process is None
+    model.action_noise_correlation_time = 5.0
+    model.learn(4, reset_num_timesteps=False)
+    assert decays(model) == 1
+    model.save(tmp_path / "model")
+    changes = {"action_noise_correlation_time": None, "action_noise_color": 1.0}
+    loaded = SACFlow.load(tmp_path / "model", env=model.get_env(), **changes)
+    loaded.learn(4, reset_num_timesteps=False)
+    assert decays(loaded) > pink
+    with pytest.raises(ValueError, match=r"action_noise_color must be between 0 .* got 99"):
+        SACFlow.load(tmp_path / "model", action_noise_color=99.0)
+
+
+def test_settings_of_a_batch_can_change() -> None:
+    settings = {name: value for name, value in FAST.items() if name != "seed"}
+    batch = SeedBatch("GaussPolicy", "TunnelDiagonal-v0", 2, **settings)
+    batch.learn(12)
+    assert batch._process is None
+    updates = batch._noise["updates"]
+    for model in batch.models:
+        model.action_noise_color = 1.0
+    batch.learn(4, reset_num_timesteps=False)
+    assert batch._process is not None
+    assert batch._noise["actions"].shape == batch._process.white_shape[1:]
+    assert batch._noise["updates"] is updates  # whose numbers go on
+    for model in batch.models:
+        model.action_noise_color = 0.0
+    batch.learn(4, reset_num_timesteps=False)
+    assert batch._process is None
+
+
+def test_processes_need_not_send_their_spec() -> None:
+    """A spec with a lambda in it cannot be pickled."""
+    gym.register("Unsendable-v0", lambda: Pendulum(), max_episode_steps=40)
+    try:
+        env = make_vec_env(
+            "Unsendable-v0",
+            2,
+            vec_env_cls=SubprocVecEnv,
+            vec_env_kwargs={"start_method": "fork"},  # which knows what was registered
+        )
+        model = SACFlow("GaussPolicy", env, **FAST, action_noise_color=1.0).learn(12)
+        env.close()
+        reference = SACFlow("GaussPolicy", "TunnelDiagonal-v0", **FAST, action_noise_color=1.0)
+        assert decays(model) == decays(reference.learn(12))  # also cut after 40 steps
+    finally:
+        del gym.registry["Unsendable-v0"]

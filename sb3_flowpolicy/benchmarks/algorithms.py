@@ -206,7 +206,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("--task", choices=list(TASKS), default="pendulum")
     add("--algorithms", choices=list(CONTENDERS), nargs="+", help="default: all of the task's")
-    add("--policies", nargs="+", help="stock, gauss, lowrank, flow; default: all")
+    policies = ["stock", "gauss", "lowrank", "flow"]
+    add("--policies", choices=policies, nargs="+", help="those that an algorithm has; default: all")
     add("--seeds", type=int, nargs="+", default=[1, 2, 3])
     add("--episodes", type=int, default=10, help="episodes per test")
     add("--csv", type=Path, default=Path("algorithms.csv"))
@@ -219,10 +220,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             import_module("pybullet_envs_gymnasium")
     rows = list(csv.reader(args.csv.open())) if args.csv.exists() else [list(COLUMNS)]
     done = {tuple(row[:4]) for row in rows}
+    unknown = sorted(set(args.algorithms or []) - set(task.steps))
+    if unknown:
+        parser.error(f"--algorithms of {args.task} must be among {[*task.steps]}, got {unknown}")
     runs = [
         (args.task, algorithm, policy, str(seed))
         for algorithm in args.algorithms or task.steps
-        for policy in args.policies or CONTENDERS[algorithm][1]
+        for policy in CONTENDERS[algorithm][1]
+        if policy in (args.policies or CONTENDERS[algorithm][1])
         for seed in args.seeds
     ]
     for run in tqdm([run for run in runs if run not in done], file=sys.stderr):

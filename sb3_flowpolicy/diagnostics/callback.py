@@ -74,12 +74,13 @@ class PolicyDiagnosticsCallback(BaseCallback):
         self.n_samples = _at_least("n_samples", n_samples, 2)
 
     def _on_training_start(self) -> None:
-        if not isinstance(self.model.actor, FlowActor):
+        actor = getattr(self.model, "actor", None)  # on-policy algorithms have none
+        if not isinstance(actor, FlowActor):
             raise ValueError(
-                "PolicyDiagnosticsCallback needs a policy of sb3_flowpolicy, "
+                "PolicyDiagnosticsCallback needs a policy of sb3_flowpolicy, off-policy, "
                 f"got {type(self.model.policy).__name__}"
             )
-        self._actor = self.model.actor
+        self._actor = actor
         for output in self.logger.output_formats:
             if isinstance(output, TensorBoardOutputFormat):
                 output.writer.add_custom_scalars(DASHBOARD)

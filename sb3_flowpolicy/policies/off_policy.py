@@ -90,9 +90,8 @@ class DistributionPolicy(BasePolicy):
                 f"distribution_kwargs must have strings as keys, got {distribution_kwargs!r}"
             )
         _check_net_arch(policy_kwargs.get("net_arch"))
-        theirs = next(
-            base for base in type(self).__mro__ if not issubclass(base, DistributionPolicy)
-        )
+        policies = [base for base in type(self).__mro__ if issubclass(base, BasePolicy)]
+        theirs = next(base for base in policies if not issubclass(base, DistributionPolicy))
         unknown = sorted(set(policy_kwargs) - set(inspect.signature(theirs).parameters))
         if unknown:
             raise ValueError(

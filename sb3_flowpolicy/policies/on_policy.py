@@ -16,7 +16,9 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.finite import all_finite
 from sb3_flowpolicy.policies.extractors import for_dicts, for_images
+from sb3_flowpolicy.policies.off_policy import check_finite_actions
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # Of SB3's normal distributions, which are not built.
@@ -27,8 +29,9 @@ class DensityActorCritic(ActorCriticPolicy):
     """Actor-critic policy with a registered density as its action distribution.
 
     The log-probability of an action is that of the very numbers in the rollout buffer, by the
-    density's inverse, while collecting and while learning. So the ratio of PPO is exactly 1
-    before the first update, however far an action is saturated. The entropy bonus is a Monte
+    density's inverse, while collecting and while learning. So the ratio of PPO is 1 before the
+    first update, however far an action is saturated (up to rounding, which flows with extreme
+    weights amplify). The entropy bonus is a Monte
     Carlo estimate whose gradient reaches all parameters of the density.
 
     Args:
@@ -68,6 +71,8 @@ class DensityActorCritic(ActorCriticPolicy):
     ) -> None:
         if not isinstance(action_space, spaces.Box):
             raise ValueError(f"action_space must be a Box, got {action_space}")
+        if not isinstance(squash_output, bool):
+            raise ValueError(f"squash_output must be True or False, got {squash_output!r}")
         if squash_output and not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
                 "action_space must have finite bounds for actions to be squashed into, got "
@@ -77,6 +82,7 @@ class DensityActorCritic(ActorCriticPolicy):
             raise ValueError("use_sde must be False: gSDE is a density of its own, got True")
         if not isinstance(distribution_kwargs, Mapping | None):
             raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
+        _check_net_arch(policy_kwargs.get("net_arch"))
         bases = [base for base in type(self).__mro__ if issubclass(base, ActorCriticPolicy)]
         known = {name for base in bases for name in inspect.signature(base).parameters} - _NOT_OURS
         unknown = sorted(set(policy_kwargs) - known)
@@ -106,6 +112,36 @@ class DensityActorCritic(ActorCriticPolicy):
         parameters, rate = self.parameters(), lr_schedule(1)
         self.optimizer = self.optimizer_class(parameters, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Return actions, values and log-probabilities, as SB3's.
+
+        Raises:
+            ValueError: If an action is not finite, which has an observation or weights for a cause.
+        """
+        found = super().forward(*args, **kwargs)
+        check_finite_actions(found[0].detach().cpu().numpy())
+        return found
+
+    def evaluate_actions(self, *args: Any, **kwargs: Any) -> Any:
+        """Return values, log-probabilities and entropies of stored actions, as SB3's.
+
+        Raises:
+            ValueError: If a log-probability is not finite.
+        """
+        found = super().evaluate_actions(*args, **kwargs)
+        if not all_finite(found[1].detach().cpu().numpy()):
+            raise ValueError(
+                "observations and weights must be finite to learn from, got log-probabilities "
+                "with NaN or infinity"
+            )
+        return found
+
+    def _predict(self, *args: Any, **kwargs: Any) -> Any:
+        found = super()._predict(*args, **kwargs)
+        actions = found[0] if isinstance(found, tuple) else found  # a memory comes along
+        check_finite_actions(actions.detach().cpu().numpy())
+        return found
+
     def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
         return self.action_dist.proba_distribution(latent_pi)
 
@@ -120,6 +156,15 @@ class DensityActorCritic(ActorCriticPolicy):
             share_features_extractor=self.share_features_extractor,
         )
         return data
+
+
+def _check_net_arch(net_arch: Any) -> None:
+    """Raise ``ValueError`` unless these are units per layer, for actor and critic or each."""
+    if isinstance(net_arch, Mapping) and not set(net_arch) <= {"pi", "vf"}:
+        raise ValueError(f"net_arch must have the keys 'pi' and 'vf', got {list(net_arch)}")
+    parts = net_arch.values() if isinstance(net_arch, Mapping) else [net_arch]
+    if net_arch is not None and not all(isinstance(part, list | tuple) for part in parts):
+        raise ValueError(f"net_arch must be a list of units per layer, got {net_arch!r}")
 
 
 class FlowActorCriticPolicy(DensityActorCritic):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 
 from sb3_flowpolicy.policies.on_policy import FlowActorCriticPolicy
@@ -10,9 +12,28 @@ from sb3_flowpolicy.policies.on_policy import FlowActorCriticPolicy
 class FlowLstmPolicy(FlowActorCriticPolicy, RecurrentActorCriticPolicy):
     """:class:`FlowActorCriticPolicy` with the memory of ``RecurrentActorCriticPolicy``.
 
+    Actions are clipped to the action space and not squashed: sb3-contrib's ``RecurrentPPO`` clips
+    whatever it collects, and would not rescale squashed actions.
+
+    Args:
+        *args: As for :class:`FlowActorCriticPolicy`.
+        squash_output: False.
+        **kwargs: As for :class:`FlowActorCriticPolicy` and ``RecurrentActorCriticPolicy``.
+
+    Raises:
+        ValueError: If ``squash_output`` is anything else.
+
     Example:
         >>> from sb3_contrib import RecurrentPPO
         >>> kwargs = dict(lstm_hidden_size=16)
         >>> model = RecurrentPPO(FlowLstmPolicy, "Pendulum-v1", n_steps=64, policy_kwargs=kwargs)
         >>> _ = model.learn(64)
     """
+
+    def __init__(self, *args: Any, squash_output: bool = False, **kwargs: Any) -> None:
+        if squash_output is not False:
+            raise ValueError(
+                "squash_output must be False, as sb3-contrib's RecurrentPPO does not rescale "
+                f"actions while it collects, got {squash_output!r}"
+            )
+        super().__init__(*args, squash_output=False, **kwargs)

@@ -107,5 +107,7 @@ def test_bad_arguments(argument: dict[str, int], message: str) -> None:
 
 def test_stock_policies_are_refused() -> None:
     model = SAC("MlpPolicy", "Pendulum-v1", **FAST)
-    with pytest.raises(ValueError, match="needs a policy of sb3_flowpolicy, got SACPolicy"):
+    with pytest.raises(
+        ValueError, match="needs a policy of sb3_flowpolicy, off-policy, got SACPolicy"
+    ):
         model.learn(10, callback=PolicyDiagnosticsCallback())

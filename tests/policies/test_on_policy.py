@@ -222,11 +222,62 @@ def test_recurrent_ppo(tmp_path: Path) -> None:
     found, same_memory = loaded.predict(obs, deterministic=True)
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(same_memory, memory)
+    with pytest.raises(ValueError, match=r"squash_output must be False.* got True"):
+        RecurrentPPO(FlowLstmPolicy, Box2D(), policy_kwargs={"squash_output": True})
+
+
+class Shifted(Box2D):
+    """A box that does not contain what tanh returns; notes what it is sent."""
+
+    action_space = spaces.Box(10, 20, (2,))
+
+    def __init__(self) -> None:
+        self.received: list[np.ndarray] = []
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.received.append(action.copy())
+        return super().step(action)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy"), [(PPO, FlowActorCriticPolicy), (RecurrentPPO, FlowLstmPolicy)]
+)
+def test_environments_are_sent_the_actions_that_are_learned_from(
+    algorithm: Any, policy: type[ActorCriticPolicy]
+) -> None:
+    env = Shifted()
+    model = algorithm(policy, env, n_steps=32, batch_size=32, n_epochs=1, seed=0).learn(32)
+    stored = model.rollout_buffer.actions.reshape(-1, 2)
+    if model.policy.squash_output:
+        expected = model.policy.unscale_action(stored)
+    else:
+        expected = stored.clip(10, 20)
+    np.testing.assert_allclose(np.stack(env.received), expected, rtol=1e-6)
+    if model.policy.squash_output:
+        assert np.stack(env.received).std() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy"), [(PPO, FlowActorCriticPolicy), (RecurrentPPO, FlowLstmPolicy)]
+)
+def test_nan_is_refused(algorithm: Any, policy: type[ActorCriticPolicy]) -> None:
+    model = algorithm(policy, Box2D(), n_steps=16, batch_size=16, n_epochs=1, seed=0)
+    with pytest.raises(ValueError, match="must be finite for an action to be"):
+        model.predict(np.full(3, np.nan, np.float32))
+    model.learn(16)
+    with th.no_grad():
+        model.policy.value_net.weight.fill_(th.nan)  # which no action shows
+        model.policy.mlp_extractor.policy_net[0].weight[0, 0] = th.nan
+    with pytest.raises(ValueError, match="must be finite for an action to be"):
+        model.learn(16, reset_num_timesteps=False)
 
 
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
+        ({"squash_output": "no"}, "squash_output must be True or False, got 'no'"),
+        ({"net_arch": 4}, "net_arch must be a list of units per layer, got 4"),
+        ({"net_arch": {"pi": [4], "qf": [4]}}, r"net_arch must have the keys 'pi' and 'vf', got"),
         ({"distribution": "nvp"}, "distribution must be one of"),
         ({"distribution_kwargs": {"layer": 2}}, 'distribution_kwargs of "realnvp" must be among'),
         ({"distribution_kwargs": 4}, "distribution_kwargs must be a dict, got 4"),
