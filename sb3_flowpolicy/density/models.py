@@ -81,8 +81,8 @@ class OurRealNVP(FlowModel):
         for pair in self.flow.pairs:
             halves = list(value.split(1, dim=-1))
             for turn, coupling in enumerate(pair.couplings):
-                shift, log_scale = coupling(halves[turn], shares.pop(0))
-                halves[1 - turn] = halves[1 - turn] * log_scale.exp() + shift
+                outputs = coupling(halves[turn], shares.pop(0))
+                halves[1 - turn], _ = coupling.move(halves[1 - turn], outputs)
                 value = th.cat(halves, dim=-1)
                 images.append(value)
         return images

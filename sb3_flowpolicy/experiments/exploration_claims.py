@@ -75,7 +75,7 @@ EXPLORATION_CLAIMS = (
         "There is no claim to reproduce: each line says whether that agent gets there.",
     ),
     Experiment(
-        name="exploration-benchmark-square",
+        name="exploration-square",
         claim="X2",
         source="ours",
         title="The square to move along x for every way to explore",

@@ -77,7 +77,7 @@ def export_onnx(
     policy = model.policy
     if not isinstance(policy, DistributionPolicy) or not isinstance(policy.actor, FlowActor):
         raise ValueError(
-            "model must have an off-policy policy of sb3_flowpolicy with use_sde=False, got "
+            "model must have a policy of sb3_flowpolicy with use_sde=False, got "
             f"{type(policy).__name__} with an actor of type "
             f"{type(getattr(policy, 'actor', None)).__name__}"
         )
