@@ -145,7 +145,6 @@ TUNNEL_CLAIMS = (
             for count in DIMENSIONS
             for agent in (LOW_RANK, FLOW)
         ),
-        eval_every=2000,
         notes="Everything but the number of dimensions is as in sparse-fixed-alpha. There is no "
         "claim to reproduce: each line says whether that agent still gets there.",
     ),
