@@ -28,6 +28,7 @@ from sb3_flowpolicy.demonstrations import (
     load_demonstrations,
 )
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
+from sb3_flowpolicy.engine.subnormals import flushed_subnormals
 from sb3_flowpolicy.exploration import ColoredExploration
 from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
 from sb3_flowpolicy.guard import TrainingGuard
@@ -320,7 +321,8 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         self._guard.before_updates()
         hook = self.critic.optimizer.register_step_pre_hook(scale_gradient)
         try:
-            super().train(gradient_steps, batch_size)
+            with flushed_subnormals():
+                super().train(gradient_steps, batch_size)
         finally:
             hook.remove()
         logged = self.logger.name_to_value

@@ -14,6 +14,7 @@ from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
+from sb3_flowpolicy.engine.subnormals import flushed_subnormals
 from sb3_flowpolicy.engine.threads import threads_for
 from sb3_flowpolicy.engine.update import (
     Batch,
@@ -209,7 +210,7 @@ class Engine:
         if noise is None:
             shape = (*obs.shape[:2], self.networks.noise_dim)
             noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
-        with threads_for(actor.numel() * obs.shape[1]):
+        with threads_for(actor.numel() * obs.shape[1]), flushed_subnormals():
             if self._runs_compiled():
                 return self._compiled_sample(obs.shape, actor, obs, noise)
             return self._sample(actor, obs, noise)
@@ -288,7 +289,7 @@ class Engine:
         state = self.state()
         history = self.history = []
         n_parameters = state.actor.numel() + state.critic.numel()
-        with threads_for(n_parameters * batches[0].rewards.shape[1]):
+        with threads_for(n_parameters * batches[0].rewards.shape[1]), flushed_subnormals():
             for k, batch in enumerate(batches, start):
                 move_target = k % first.target_update_interval == 0
                 if self._runs_compiled():
