@@ -12,6 +12,7 @@ from sb3_flowpolicy.experiments.costs import in_words, plan_seconds
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
+from sb3_flowpolicy.experiments.shared_items import adopt
 from sb3_flowpolicy.experiments.work import FIRST_SEED, SEEDS_PER_ITEM, make_plan
 
 OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")}
@@ -76,6 +77,10 @@ def _run(args: argparse.Namespace) -> None:
     )
     out = args.out or OUT[args.profile]
     with results_folder(out, plan) as folder:
+        adopted = adopt(folder, unfinished(folder, plan))
+        for source in sorted(set(adopted.values())):
+            shared = [key for key, name in adopted.items() if name == source]
+            print(f"Taken from {source}, which did the same: {', '.join(shared)}")
         items = unfinished(folder, plan)
         finished = {item.key for item in plan.items} - {item.key for item in items}
         print(

@@ -15,6 +15,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from sb3_flowpolicy.experiments.costs import item_seconds
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
 from sb3_flowpolicy.experiments.work import Plan, WorkItem
@@ -76,7 +77,8 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
             min(workers, len(items)), context, initializer=_start_worker, initargs=(reports,)
         ) as pool,
     ):
-        running: set[Future] = {pool.submit(_work, item, folder) for item in items}
+        longest_first = sorted(items, key=item_seconds, reverse=True)
+        running: set[Future] = {pool.submit(_work, item, folder) for item in longest_first}
         try:
             while running:
                 _pass_on(reports, progress)

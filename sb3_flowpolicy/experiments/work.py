@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -79,7 +80,7 @@ class Plan:
             "experiment": self.experiment.name,
             "steps": self.steps,
             "seeds": list(self.seeds),
-            "items": {item.key: _describe(item) for item in self.items},
+            "items": {item.key: describe(item) for item in self.items},
         }
 
 
@@ -173,14 +174,15 @@ def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, An
     return merged
 
 
-def _describe(item: WorkItem) -> dict[str, Any]:
+def describe(item: WorkItem) -> dict[str, Any]:
+    """Return everything that the item's results depend on, ready for JSON."""
     described = {name: value for name, value in vars(item).items() if name != "key"}
     spec = gym.spec(item.env_id)
     described["env_registration"] = {
         "kwargs": spec.kwargs,
         "max_episode_steps": spec.max_episode_steps,
     }
-    return described
+    return json.loads(json.dumps(described))  # tuples become lists, as they are read back
 
 
 def environment(item: WorkItem) -> str:

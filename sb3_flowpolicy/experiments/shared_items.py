@@ -1,0 +1,67 @@
+"""Items that two experiments have in common are trained once."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_flowpolicy.benchmarks.report import machine
+from sb3_flowpolicy.experiments.store import ItemFiles, read_json
+from sb3_flowpolicy.experiments.work import WorkItem, describe
+
+# How an experiment calls an item; the rest of its description is what it does.
+_NAMES = ("setting", "agent")
+
+
+def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
+    """Copy finished items of other experiments that did exactly the same.
+
+    The same is: equal in everything that results depend on, at the same commit, with the same
+    versions. Where the commit is not known, or source files differ from it, nothing is copied;
+    neither is an item whose files are not as long as they were when it was finished.
+
+    Args:
+        folder: Folder of the experiment, claimed; others lie beside it.
+        items: What is still to be done.
+
+    Returns:
+        Key of each copied item to the experiment that it came from.
+
+    Raises:
+        ValueError: If a settings file beside the folder is corrupt; the message names it.
+    """
+    here = machine()
+    adopted: dict[str, str] = {}
+    if here["commit"] is None or here["commit"].endswith("-dirty"):
+        return adopted
+    wanted = {_work(describe(item)): item.key for item in items}
+    for path in sorted(folder.parent.glob("*/settings.json")):
+        if path.parent == folder:
+            continue
+        for key, described in read_json(path).get("items", {}).items():
+            mine = wanted.get(_work(described))
+            there = ItemFiles(path.parent, key)
+            done = there.read_done()
+            if mine is None or mine in adopted or done is None:
+                continue
+            same_code = all(done["machine"][name] == here[name] for name in ("commit", "versions"))
+            if same_code and there.lengths() == {k: done.get(k) for k in there.lengths()}:
+                _copy(there, ItemFiles(folder, mine), done)
+                adopted[mine] = path.parent.name
+    return adopted
+
+
+def _work(described: dict[str, Any]) -> str:
+    return json.dumps({k: v for k, v in described.items() if k not in _NAMES}, sort_keys=True)
+
+
+def _copy(there: ItemFiles, here: ItemFiles, done: dict[str, Any]) -> None:
+    shutil.rmtree(here.checkpoints, ignore_errors=True)
+    for source, target in ((there.table, here.table), (there.details, here.details)):
+        target.unlink(missing_ok=True)
+        if source.exists():
+            shutil.copyfile(source, target)
+    here.finish({**done, "adopted_from": f"{there.folder.name}/{there.key}"})
