@@ -12,6 +12,7 @@ from torch import nn
 from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, took_equal_steps
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
+from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
 from sb3_flowpolicy.engine.subnormals import flushed_subnormals
@@ -147,6 +148,7 @@ class Engine:
         self.history: list[th.Tensor] = []
         self._rows: ReplayRows | None = None
         self._state: TrainState | None = None
+        self._grouped: tuple[int, list[tuple[slice, TrainState]]] | None = None
         self._fixed: list[tuple[th.Tensor, int]] = []
         self._learning_rates: tuple[list[float], th.Tensor] | None = None
         self._sample = sample
@@ -226,7 +228,18 @@ class Engine:
         )
         if self._state is None or not same:
             self._state, self._fixed = self._gather_state(fixed), known
+            self._grouped = None
         return self._state
+
+    def _groups(self, batch_size: int) -> list[tuple[slice, TrainState]]:
+        """Return the seeds that are updated together, and their part of the state."""
+        state, count = self.state(), len(self.models)
+        if self._grouped is None or self._grouped[0] != batch_size:
+            size = seeds_at_once(self.models[0].critic, count, batch_size)
+            slices = [slice(start, start + size) for start in range(0, count, size)]
+            groups = [(seeds, state if size == count else state.of(seeds)) for seeds in slices]
+            self._grouped = batch_size, groups
+        return self._grouped[1]
 
     def _gather_state(self, fixed: list[th.Tensor]) -> TrainState:
         def moments(adam: FlatAdam) -> Moments:
@@ -286,19 +299,30 @@ class Engine:
             device = self.networks.actor.data.device
             self._learning_rates = rates, th.tensor(rates, dtype=th.float64, device=device)
         learning_rates = self._learning_rates[1]
-        state = self.state()
+        groups = self._groups(batches[0].rewards.shape[1])
         history = self.history = []
+        state = groups[0][1]
         n_parameters = state.actor.numel() + state.critic.numel()
         with threads_for(n_parameters * batches[0].rewards.shape[1]), flushed_subnormals():
             for k, batch in enumerate(batches, start):
                 move_target = k % first.target_update_interval == 0
-                if self._runs_compiled():
-                    key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), move_target)
-                    losses = self._compiled_update(key, state, batch, learning_rates, move_target)
-                else:
-                    losses = self._update(state, batch, learning_rates, move_target)
-                history.append(losses)
+                if len(groups) == 1:
+                    history.append(self._update_once(state, batch, learning_rates, move_target))
+                    continue
+                losses = [
+                    self._update_once(part, batch.of(seeds), learning_rates, move_target)
+                    for seeds, part in groups
+                ]
+                history.append(th.cat(losses, dim=1))
         return history[0] if len(history) == 1 else th.stack(history).mean(0)
+
+    def _update_once(
+        self, state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
+    ) -> th.Tensor:
+        if not self._runs_compiled():
+            return self._update(state, batch, learning_rates, move_target)
+        key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), move_target)
+        return self._compiled_update(key, state, batch, learning_rates, move_target)
 
 
 def _can_be_rows(model: SAC) -> bool:

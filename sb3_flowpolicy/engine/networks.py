@@ -28,6 +28,8 @@ class _ActionLogProb(nn.Module):
 class StackedNetworks:
     """The networks of S policies that differ in nothing but their weights.
 
+    Its functions take the parameters of any number of them.
+
     Args:
         policies: S policies with a :class:`FlowActor` and parameter-free features extractors.
         autocast: Whether matrix products run in bfloat16; parameters and results stay as they are.
@@ -36,7 +38,6 @@ class StackedNetworks:
     def __init__(self, policies: Sequence[SACPolicy], autocast: bool = False) -> None:
         first = policies[0]
         assert isinstance(first.actor, FlowActor)
-        self.n_seeds = len(policies)
         self.autocast = autocast
         self.actor = FlatParameters([_actor_layout(policy) for policy in policies])
         self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies], True)
@@ -62,7 +63,7 @@ class StackedNetworks:
         """
         parameters = self.actor.unflatten(actor)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
-            if self.n_seeds > 1:
+            if len(actor) > 1:
                 actions, log_prob = vmap(self._sample_one)(parameters, obs, noise)
             else:
                 # No detour for one seed: vmap would turn products into batched ones.

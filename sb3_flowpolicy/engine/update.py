@@ -19,6 +19,10 @@ class Moments(NamedTuple):
     square: th.Tensor
     step: th.Tensor
 
+    def of(self, seeds: slice) -> Moments:
+        """Return some seeds' part, as views."""
+        return Moments(*(tensor[seeds] for tensor in self))
+
 
 class TrainState(NamedTuple):
     """Everything an update changes; all of it is written in place."""
@@ -31,6 +35,18 @@ class TrainState(NamedTuple):
     critic_moments: Moments
     ent_coef_moments: Moments | None  # None: the temperature is fixed
 
+    def of(self, seeds: slice) -> TrainState:
+        """Return some seeds' part, as views."""
+        return TrainState(
+            self.actor[seeds],
+            self.critic[seeds],
+            self.target[seeds],
+            self.temperature[seeds],
+            self.actor_moments.of(seeds),
+            self.critic_moments.of(seeds),
+            None if self.ent_coef_moments is None else self.ent_coef_moments.of(seeds),
+        )
+
 
 class Batch(NamedTuple):
     """One minibatch per seed, and the noise to sample actions with."""
@@ -42,6 +58,18 @@ class Batch(NamedTuple):
     rewards: th.Tensor  # (S, B)
     discounts: th.Tensor  # (S, B)
     noise: th.Tensor  # (2, S, B, M): for the current and for the next observations
+
+    def of(self, seeds: slice) -> Batch:
+        """Return some seeds' part, as views."""
+        return Batch(
+            self.obs[seeds],
+            self.actions[seeds],
+            self.next_obs[seeds],
+            self.dones[seeds],
+            self.rewards[seeds],
+            self.discounts[seeds],
+            self.noise[:, seeds],
+        )
 
 
 LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")

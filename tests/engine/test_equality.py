@@ -15,8 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.engine import Engine
-from sb3_flowpolicy.engine.update import Batch
+from sb3_flowpolicy.engine import Engine, groups
 
 N_UPDATES = 20
 BATCH_SIZE = 32
@@ -186,11 +185,36 @@ def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th
     for step, batch in enumerate(stacked.draw(N_UPDATES, BATCH_SIZE)):
         losses = stacked._update(stacked.state(), batch, rate, step % 2 == 0)
         for seed, single in enumerate(singles):
-            own = Batch(*(part[seed : seed + 1] for part in batch[:-1]), batch.noise[:, [seed]])
+            own = batch.of(slice(seed, seed + 1))
             expected = single._update(single.state(), own, rate, step % 2 == 0)
             th.testing.assert_close(losses[:, [seed]], expected, rtol=1e-4, atol=1e-5)
     for got, single in zip(stacked.models, singles, strict=True):
         assert_close(everything(got), everything(single.models[0]), dtype)
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "compiled"])
+@pytest.mark.parametrize("ent_coef", [0.1, "auto"])
+def test_updating_seeds_in_groups_changes_nothing(
+    ent_coef: Any, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Large networks are updated a few seeds at a time, because their activations fit the cache."""
+    n_seeds, engines = 4, []
+    for bytes_at_once in (10**9, 2 * 2 * 16 * BATCH_SIZE * 4):
+        monkeypatch.setattr(groups, "BYTES_AT_ONCE", bytes_at_once)
+        policies = [make(SACFlow, "FlowPolicy", th.float32, s, ent_coef=ent_coef) for s in range(4)]
+        engine = Engine(policies, compiled=compiled)
+        seed_everything()
+        losses = [engine.train(engine.draw(5, BATCH_SIZE)) for _ in range(2)]
+        assert [len(part.actor) for _, part in engine._groups(BATCH_SIZE)] == (
+            [n_seeds] if bytes_at_once == 10**9 else [2, 2]
+        )
+        assert engine._runs_compiled() == compiled
+        engines.append((engine, th.stack(losses)))
+    (whole, expected), (grouped, losses_in_groups) = engines
+    assert expected.shape == (2, 4, n_seeds)
+    th.testing.assert_close(losses_in_groups, expected, rtol=1e-4, atol=1e-5)
+    for got, wanted in zip(grouped.models, whole.models, strict=True):
+        assert_close(everything(got), everything(wanted), th.float32)
 
 
 @pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY])
