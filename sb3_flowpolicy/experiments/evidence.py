@@ -20,8 +20,8 @@ SOLVED = 0.8
 # Evaluations in a row that have to show it, for "at its best" and for "steps until solved".
 IN_A_ROW = 3
 
-OSCILLATIONS = {"train_return": 0.3, "entropy": 1.0, "log_ent_coef": 0.4}
-"""What counts as a swing: a quarter of the return, a nat, half again of the temperature."""
+OSCILLATIONS = {"train_return": 0.25, "entropy": 1.0, "log_ent_coef": 0.1}
+"""What counts as a swing: a quarter of the best test return, a nat, a tenth of the temperature."""
 SWINGS_OF_AN_OSCILLATION = 3
 """Up, down and up again, or the reverse: a single overshoot is no oscillation."""
 
@@ -151,7 +151,9 @@ class Evidence:
         """
         _, success = self.curves(setting, agent, "train_success")
         counts = []
-        for metric, amplitude in OSCILLATIONS.items():
+        amplitudes = {**OSCILLATIONS}
+        amplitudes["train_return"] *= self._best_test_return(setting)
+        for metric, amplitude in amplitudes.items():
             _, values = self.curves(setting, agent, metric.removeprefix("log_"))
             curves = np.log(values) if metric.startswith("log_") else values
             smooth = running_mean(curves, IN_A_ROW)
@@ -162,6 +164,11 @@ class Evidence:
                 ]
             )
         return np.min(counts, axis=0)
+
+    def _best_test_return(self, setting: str) -> float:
+        """Return the highest test return of any agent, which the swings are measured by."""
+        agents = [one.name for one in self.experiment.agents if self.has(setting, one.name)]
+        return max(float(self.curves(setting, one, "test_return")[1].max()) for one in agents)
 
     def profile(self, setting: str, agent: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return shares of the way (K,) and the entropy there (S, K) at the end of training."""
