@@ -16,12 +16,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Told apart by every common kind of colour vision, and in print (Okabe and Ito).
+# Those of the thesis's agents are told apart by every common kind of colour vision, and in print
+# (Okabe and Ito); ten are more than can be.
 COLOURS = {
     "gauss": "#d55e00",
     "lowrank": "#009e73",
     "flow": "#0072b2",
     "flow-default-init": "#cc79a7",
+    "gauss-pink": "#8c2d04",
+    "gsde": "#999999",
+    "lattice": "#f0e442",
+    "full-covariance": "#66c2a5",
+    "flow-pink": "#56b4e9",
+    "spline": "#6a3d9a",
+    "spline-pink": "#cab2d6",
 }
 PANELS = ("train_return", "test_return", "test_success", "entropy", "ent_coef")
 SMOOTHED_OVER = 3

@@ -16,6 +16,7 @@ from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import NOT_MEASURED, Finding
 from sb3_flowpolicy.experiments.figures import SMOOTHED_OVER, curves_figure, panels, profile_figure
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
+from sb3_flowpolicy.experiments.outcomes import outcomes_figure
 from sb3_flowpolicy.experiments.policy_pictures import policies_figure
 from sb3_flowpolicy.experiments.statistics import RESAMPLES
 from sb3_flowpolicy.experiments.store import write_text
@@ -100,6 +101,7 @@ class Section:
         if not self.measured:
             return {}
         found = {
+            "outcomes": outcomes_figure(self.evidence),
             "curves": curves_figure(self.evidence),
             "profile": profile_figure(self.evidence),
             "policies": policies_figure(self.evidence),
@@ -257,7 +259,7 @@ def _inline(figures: dict[str, Figure]) -> dict[str, str]:
     return {
         name: "data:image/png;base64," + base64.b64encode(_png(figure, dpi=90)).decode()
         for name, figure in figures.items()
-        if name == "policies"
+        if name in ("outcomes", "policies")
     }
 
 

@@ -21,6 +21,7 @@ from sb3_flowpolicy.experiments.experiment import (
     REPRODUCED,
 )
 from sb3_flowpolicy.experiments.manifest import find
+from sb3_flowpolicy.experiments.outcomes import outcomes_figure
 from sb3_flowpolicy.experiments.report import Section, read_results, write_docs, write_report
 from sb3_flowpolicy.experiments.store import ItemFiles
 from tests.experiments.conftest import MakeUp
@@ -113,6 +114,17 @@ def test_oscillations_are_what_all_three_curves_do(make_up: MakeUp, tmp_path: Pa
     counts = evidence("circle-narrow", tmp_path).oscillations("narrow", "gauss")
     assert (counts[:5] >= 7).all()
     assert counts[5:].max() <= 1
+
+
+def test_outcomes_are_counted_per_agent_and_setting(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("sparse-fixed-alpha", {"diagonal-gauss": 0.0})
+    figure = outcomes_figure(evidence("sparse-fixed-alpha", tmp_path))
+    assert figure is not None
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert texts.count("10 of 10\n32,000 steps") == 5
+    assert texts.count("0 of 10") == 1  # no steps: nobody ever solved it
+    make_up("circle-fixed-alpha")
+    assert outcomes_figure(evidence("circle-fixed-alpha", tmp_path)) is None
 
 
 def test_a_try_out_is_no_result(make_up: MakeUp, tmp_path: Path) -> None:
