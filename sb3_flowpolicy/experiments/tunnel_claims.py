@@ -72,7 +72,12 @@ TUNNEL_CLAIMS = (
         measures=("profile",),
         pictures_at=(1.0,),
         notes="The target is minus the dimension of the action space. 'About twice' is taken to "
-        "be at least 1.5 times.",
+        "be at least 1.5 times. Seen afterwards: how far the returns part depends on how progress "
+        "is paid next to the goal, which the thesis does not tell; with ours the way alone earns "
+        "1.36, so a Gauss that fails three episodes in four still earns most of it. In training "
+        "success the two are three times apart. All agents hold most entropy just before the goal, "
+        "where any step will do; that hides Gauss's early entropy from a rule that compares the "
+        "first third of the way with the last. The rule was not changed.",
     ),
     Experiment(
         name="circle-narrow",
