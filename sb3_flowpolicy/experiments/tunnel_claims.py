@@ -161,12 +161,12 @@ TUNNEL_CLAIMS = (
             for count in DIMENSIONS
             for agent in (LOW_RANK, FLOW)
         ),
-        notes="Everything but the number of dimensions is as in sparse-fixed-alpha, the width of the "
-        "tunnel included. There is no claim to reproduce: each line says whether that agent still "
+        notes="Everything but the number of dimensions is as in sparse-fixed-alpha, including the "
+        "tunnel's width. There is no claim to reproduce: each line says whether that agent still "
         "gets there. Of independent uniform actions 8.6 % stay inside with two dimensions, 0.02 % "
         "with four, and fewer than one in 400 000 with eight: a correlation cannot be learned from "
         "steps that never happen. Tried on three other seeds (100 to 102, 40 000 steps): a width "
-        "that lets 8.6 % of them stay with eight dimensions. NF solved it in none of them, Gauss in "
-        "one.",
+        "that lets 8.6 % of them stay with eight dimensions. NF solved it in none of them, Gauss "
+        "in one.",
     ),
 )
