@@ -57,6 +57,8 @@ def newest_step(path: Path) -> int:
 @pytest.fixture(autouse=True)
 def handlers() -> Any:
     """Whatever a test does, handlers are to be those from before; in the main thread alone."""
+    # Shells start what they run in the background with SIGINT ignored, and pytest inherits that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     yield
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
