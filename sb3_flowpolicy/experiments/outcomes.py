@@ -45,9 +45,7 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
     axes = figure.subplots()
     for (row, column), (solved, setting, agent) in fields.items():
         share = solved.mean()
-        axes.fill_between(
-            [column, column + 1], row, row + 1, color=(1 - share, 1 - 0.55 * share, 1)
-        )
+        axes.fill_between([column, column + 1], row, row + 1, color=1 - share * (1 - _FULL))
         text = f"{solved.sum()} of {len(solved)}"
         if evidence.solved_once(setting, agent).any():
             steps = interquartile_mean(evidence.steps_until_solved(setting, agent))
