@@ -181,7 +181,7 @@ def test_the_page_works_offline_in_a_browser(make_up: MakeUp, tmp_path: Path) ->
                 "--disable-gpu",
                 "--host-resolver-rules=MAP * ~NOTFOUND",
                 "--enable-logging=stderr",
-                f"--user-data-dir={tmp_path / 'profile'}",
+                f"--user-data-dir={tmp_path / f'profile-{width}'}",
                 f"--window-size={width},30000",
                 "--virtual-time-budget=30000",
                 "--dump-dom",
