@@ -345,3 +345,23 @@ def test_callbacks_may_reset_optimizers_and_move_weights() -> None:
     for model in batch.models:
         steps = {float(state["step"]) for state in model.actor.optimizer.state.values()}
         assert steps == {16.0}  # since the reset, that of step 45 included
+
+
+def test_a_learning_rate_schedule_moves_every_optimizer() -> None:
+    batch = SeedBatch(
+        "GaussPolicy",
+        "Pendulum-v1",
+        2,
+        learning_rate=lambda remaining: 1e-3 * remaining,
+        learning_starts=10,
+        batch_size=8,
+        device="cpu",
+        compile=False,
+        policy_kwargs={"net_arch": [8]},
+    )
+    batch.learn(40)
+    for model in batch.models:
+        optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
+        rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
+        assert rates[0] < 1e-4
+        assert rates == [rates[0]] * 3
