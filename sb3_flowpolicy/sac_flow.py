@@ -253,10 +253,7 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             engine = self._ready_engine()
         if engine is None:
             return self._train_with_sb3(gradient_steps, batch_size)
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
-        if self.ent_coef_optimizer is not None:
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
+        self._update_learning_rate(self.optimizers())
         # Minibatches are drawn for many updates at once, but not for all of an offline run.
         for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
             n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
@@ -266,6 +263,11 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             self._n_updates += n_updates
             self._guard.after_updates(LOSSES, losses, engine.history, batches)
             self.record_losses(losses)
+
+    def optimizers(self) -> list[th.optim.Optimizer]:
+        """Return what follows the learning rate; the temperature has one only if learned."""
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        return optimizers + ([self.ent_coef_optimizer] if self.ent_coef_optimizer else [])
 
     def record_losses(self, losses: Sequence[Sequence[float]], seed: int = 0) -> None:
         """Record what SB3's ``train`` records: the engine's losses, (4, S), of one seed."""

@@ -363,13 +363,8 @@ class SeedBatch(BatchOnDisk):
         rate = first.lr_schedule(first._current_progress_remaining)
         if rate != first.actor.optimizer.param_groups[0]["lr"]:
             for model in self._models:
-                for optimizer in (
-                    model.actor.optimizer,
-                    model.critic.optimizer,
-                    model.ent_coef_optimizer,
-                ):
-                    if optimizer is not None:
-                        update_learning_rate(optimizer, rate)
+                for optimizer in model.optimizers():
+                    update_learning_rate(optimizer, rate)
         self._guard.before_updates()
         rows = self._noise["rows"].draw_many(first.gradient_steps)
         noise = self._noise["updates"].draw_many(first.gradient_steps).transpose(1, 2)

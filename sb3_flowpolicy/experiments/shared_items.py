@@ -43,9 +43,11 @@ def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
             continue
         for key, described in read_json(path).get("items", {}).items():
             mine = wanted.get(_work(described))
+            if mine is None or mine in adopted:
+                continue
             there = ItemFiles(path.parent, key)
             done = there.read_done()
-            if mine is None or mine in adopted or done is None:
+            if done is None:
                 continue
             same_code = all(done["machine"][name] == here[name] for name in ("commit", "versions"))
             if same_code and there.lengths() == {k: done.get(k) for k in there.lengths()}:
@@ -55,6 +57,7 @@ def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
 
 
 def _work(described: dict[str, Any]) -> str:
+    """Return what is done, as text: tuples there are the lists that a file holds."""
     return json.dumps({k: v for k, v in described.items() if k not in _NAMES}, sort_keys=True)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -101,7 +100,7 @@ def _checked(values: np.ndarray, ndim: int) -> np.ndarray:
 
 @contextmanager
 def _same_digits_each_time() -> Iterator[None]:
-    """Seed numpy's global generator, which rliable 1.2 draws from whatever it is handed."""
+    """Seed numpy's global generator, which rliable 1.2 draws from whatever random state it gets."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(_BOOTSTRAP_SEED)  # noqa: NPY002
     try:
@@ -111,14 +110,9 @@ def _same_digits_each_time() -> Iterator[None]:
 
 
 def _estimate(scores: Any, statistic: Callable[..., np.ndarray], resamples: int) -> Estimate:
-    with _same_digits_each_time(), warnings.catch_warnings():
-        # rliable hands its random state to arch by an argument that arch has renamed.
-        warnings.filterwarnings("ignore", "random_state is deprecated", FutureWarning)
+    with _same_digits_each_time():
         points, intervals = library.get_interval_estimates(
-            {"scores": scores},
-            statistic,
-            reps=resamples,
-            random_state=np.random.RandomState(_BOOTSTRAP_SEED),
+            {"scores": scores}, statistic, reps=resamples
         )
     low, high = intervals["scores"][:, 0]
     return Estimate(points["scores"][0], low, high)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -175,14 +174,14 @@ def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, An
 
 
 def describe(item: WorkItem) -> dict[str, Any]:
-    """Return everything that the item's results depend on, ready for JSON."""
+    """Return everything that the item's results depend on."""
     described = {name: value for name, value in vars(item).items() if name != "key"}
     spec = gym.spec(item.env_id)
     described["env_registration"] = {
         "kwargs": spec.kwargs,
         "max_episode_steps": spec.max_episode_steps,
     }
-    return json.loads(json.dumps(described))  # tuples become lists, as they are read back
+    return described
 
 
 def environment(item: WorkItem) -> str:
