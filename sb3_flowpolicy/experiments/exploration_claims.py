@@ -47,7 +47,12 @@ EXPLORERS = (
     SPLINE_PINK,
 )
 
-_DIMENSIONS = (2, 8)
+# In eight dimensions a tunnel that couples all of them is one that nobody gets into
+# (diagonal-dimensions), so two are coupled and the six others are the policy's to waste.
+_TUNNELS = {
+    "2-dimensions": {"total_dims": 2, "coupled_dims": 2},
+    "8-dimensions": {"total_dims": 8, "coupled_dims": 2, "free_dims": 6},
+}
 
 EXPLORATION_CLAIMS = (
     Experiment(
@@ -57,22 +62,18 @@ EXPLORATION_CLAIMS = (
         title="The diagonal tunnel for every way to explore: densities, gSDE, coloured noise",
         thesis="Not in the thesis, which compares Gauss, LR and NF.",
         settings=tuple(
-            Setting(
-                f"{count}-dimensions",
-                "TunnelDiagonal-v0",
-                env_kwargs={"total_dims": count, "coupled_dims": count},
-            )
-            for count in _DIMENSIONS
+            Setting(name, "TunnelDiagonal-v0", env_kwargs=env_kwargs)
+            for name, env_kwargs in _TUNNELS.items()
         ),
         agents=EXPLORERS,
-        checks=tuple(
-            solved(f"{count}-dimensions", agent, 0.9)
-            for count in _DIMENSIONS
-            for agent in EXPLORERS
-        ),
+        checks=tuple(solved(name, agent, 0.9) for name in _TUNNELS for agent in EXPLORERS),
+        pictures_at=(1.0,),
         notes="Hyperparameters are those of sparse-fixed-alpha, for every agent. gSDE keeps its "
         "noise for 8 steps and then does 8 updates, as is usual; all others update at every step. "
-        "There is no claim to reproduce: each line says whether that agent gets there.",
+        "Of the eight dimensions two are coupled and six are free: 8.6 % of independent uniform "
+        "actions stay inside, as with two dimensions. With all eight coupled fewer than one in "
+        "400 000 do, and nobody gets there from four on (diagonal-dimensions). There is no claim "
+        "to reproduce: each line says whether that agent gets there.",
     ),
     Experiment(
         name="exploration-square",
