@@ -42,8 +42,11 @@ from sb3_flowpolicy.seed_setup import (
 # What agents must agree on, besides the constants of their updates.
 _COMMON = (
     *("batch_size", "gamma", "learning_starts", "random_steps", "train_freq", "gradient_steps"),
-    *("action_noise_color", "action_noise_correlation_time"),
+    *("action_noise_color", "action_noise_correlation_time", "target_update_interval"),
 )
+# Schedules are functions, which cannot be compared: these are the shares of training left over at
+# which they are.
+_SCHEDULE_AT = (1.0, 0.5, 0.0)
 
 
 class SeedBatch(BatchOnDisk):
@@ -274,10 +277,8 @@ class SeedBatch(BatchOnDisk):
         first, models = self._models[0], self._models
         check_stackable(first)
         settings = settings_key(first, first.critic_loss_coef)
-        for model in models:
-            same = settings_key(model, model.critic_loss_coef) == settings
-            if not same or any(getattr(model, name) != getattr(first, name) for name in _COMMON):
-                raise ValueError("agents must all have the same settings, got different ones")
+        if any(_shared_settings(model) != _shared_settings(first) for model in models[1:]):
+            raise ValueError("agents must all have the same settings, got different ones")
         compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
         engine = self._engine
         if engine is not None:
@@ -381,3 +382,11 @@ class SeedBatch(BatchOnDisk):
             rate = model.actor.optimizer.param_groups[0]["lr"]
             model.logger.record("train/learning_rate", rate)
             model.record_losses(self._losses, seed)
+
+
+def _shared_settings(model: SACFlow) -> tuple[object, ...]:
+    return (
+        settings_key(model, model.critic_loss_coef),
+        *(getattr(model, name) for name in _COMMON),
+        *(model.lr_schedule(left) for left in _SCHEDULE_AT),
+    )

@@ -219,6 +219,13 @@ def test_what_was_done_to_the_agents_in_between_is_kept(tmp_path: Path) -> None:
         assert steps == {float(model._n_updates)}
         critic, target = model.critic.state_dict(), model.critic_target.state_dict()
         assert all(th.equal(target[key], value) for key, value in critic.items())
+    changes = ("tau", 0.5), ("target_update_interval", 7), ("lr_schedule", lambda left: 1e-3 * left)
+    for name, value in changes:
+        before = getattr(batch.models[0], name)
+        setattr(batch.models[0], name, value)
+        with pytest.raises(ValueError, match="agents must all have the same settings"):
+            batch.learn(1, reset_num_timesteps=False)
+        setattr(batch.models[0], name, before)
     batch.models[0].tau = 0.5
     with pytest.raises(ValueError, match="agents must all have the same settings"):
         batch.learn(10, reset_num_timesteps=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,6 +10,8 @@ import numpy as np
 import torch as th
 
 _SUBNORMAL, _ONE = np.float32(1e-40), np.float32(1)
+# From 32768 numbers on torch shares an operation among its threads.
+_SHARED_AMONG_THREADS = 1 << 16
 
 
 @contextmanager
@@ -27,6 +30,7 @@ def flushed_subnormals() -> Iterator[None]:
         >>> bool(flushed == 0) or not th.set_flush_denormal(False)
         True
     """
+    _start_threads(th.get_num_threads())
     if _SUBNORMAL * _ONE == 0 or not th.set_flush_denormal(True):
         yield
         return
@@ -34,3 +38,10 @@ def flushed_subnormals() -> Iterator[None]:
         yield
     finally:
         th.set_flush_denormal(False)
+
+
+@functools.cache
+def _start_threads(count: int) -> None:
+    """Start torch's threads outside the block: those that start within keep flushing after it."""
+    if count > 1:
+        th.ones(_SHARED_AMONG_THREADS).add_(1)

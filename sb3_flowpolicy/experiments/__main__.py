@@ -34,11 +34,11 @@ def main(arguments: list[str] | None = None) -> int:
         print("\nInterrupted. The same command goes on from the last checkpoint.", file=sys.stderr)
         return 130
     except OSError as error:
-        print(
-            f"error: {error}. What is finished is kept; once this is mended, the same command goes "
-            "on from the last checkpoint",
-            file=sys.stderr,
+        advice = (
+            ". What is finished is kept; once this is mended, the same command goes on from the "
+            "last checkpoint"
         )
+        print(f"error: {error}{advice if args.command is _run else ''}", file=sys.stderr)
         return 1
     except (ValueError, RuntimeError, ModuleNotFoundError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -72,6 +72,10 @@ def _run(args: argparse.Namespace) -> None:
     missing = what_is_missing(experiment)
     if missing:
         raise ValueError(f"{experiment.name} needs {missing}, which is not here")
+    if args.workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {args.workers}")
+    if args.address is not None and args.backend != "ray":
+        raise ValueError(f"--address needs --backend ray, got {args.backend!r}")
     plan = make_plan(
         experiment, args.profile, args.steps, args.seeds, args.first_seed, args.seeds_per_item
     )
@@ -102,12 +106,20 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    from sb3_flowpolicy.experiments.report import write_docs, write_report
+    from sb3_flowpolicy.experiments.markdown import write_docs
+    from sb3_flowpolicy.experiments.report import write_report
 
     page = write_report(args.results, args.html or args.results / "report.html")
     print(f"Report: {page}")
     if args.docs is not None:
         print(f"Tables, figures and data: {write_docs(args.results, args.docs)}")
+
+
+class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows defaults, except of arguments that say themselves what None stands for."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default is None else super()._get_help_string(action)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -127,7 +139,7 @@ def _parser() -> argparse.ArgumentParser:
             name,
             help=text,
             description=text[0].upper() + text[1:] + ".",
-            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+            formatter_class=_HelpFormatter,
         )
         command.set_defaults(command=function)
         add = command.add_argument

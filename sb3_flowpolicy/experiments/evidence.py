@@ -9,14 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from sb3_flowpolicy.experiments.experiment import Experiment
+from sb3_flowpolicy.experiments.experiment import Experiment, NotMeasuredError
+from sb3_flowpolicy.experiments.integrity import rows_of_seeds
+from sb3_flowpolicy.experiments.settings_file import read_settings
 from sb3_flowpolicy.experiments.statistics import common_grid, on_grid, running_mean, swings
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row, read_json
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row
 
 # The share of evaluations, at the end of training, that "final" refers to, and the least number.
 FINAL_SHARE, FINAL_LEAST = 0.1, 3
 # Success rate of deterministic episodes from which on a seed has solved its task.
 SOLVED = 0.8
+# Three times 0.8, summed and divided by three, is a little less than 0.8.
+_ROUNDING = 1e-9
 # Evaluations in a row that have to show it, for "at its best" and for "steps until solved".
 IN_A_ROW = 3
 
@@ -35,7 +39,7 @@ class Evidence:
         others: Looks up the evidence of another experiment, None if there is none.
 
     Raises:
-        ValueError: If a file is corrupt.
+        ValueError: If a file is corrupt, or rows of a finished item are missing.
     """
 
     def __init__(
@@ -45,16 +49,21 @@ class Evidence:
         others: Callable[[str], Evidence | None] = lambda name: None,
     ) -> None:
         self.experiment, self.folder, self.others = experiment, folder, others
-        path = folder / "settings.json"
-        self.settings = read_json(path) if path.is_file() else {}
+        self.settings = read_settings(folder) or {}
         self.items: dict[str, dict[str, Any]] = self.settings.get("items", {})
         self.files = {key: ItemFiles(folder, key) for key in self.items}
         self.done = {key: files.read_done() for key, files in self.files.items()}
 
     @property
     def complete(self) -> bool:
-        """Whether all items are finished."""
-        return bool(self.items) and all(self.done.values())
+        """Whether all agents are there on all settings, and finished."""
+        there = {(item["setting"], item["agent"]) for item in self.items.values()}
+        wanted = {
+            (setting.name, agent.name)
+            for setting in self.experiment.settings
+            for agent in self.experiment.agents
+        }
+        return wanted <= there and all(self.done.values())
 
     @property
     def seeds(self) -> list[int]:
@@ -66,8 +75,7 @@ class Evidence:
         logs: dict[tuple[str, str], dict[int, list[Row]]] = {}
         for key, item in self.items.items():
             seeds = logs.setdefault((item["setting"], item["agent"]), {})
-            for row in self.files[key].read_rows():
-                seeds.setdefault(int(row["seed"] or 0), []).append(row)
+            seeds |= rows_of_seeds(self.files[key], item, self.done[key])
         return logs
 
     @cached_property
@@ -101,11 +109,11 @@ class Evidence:
             Steps (T,) and values (S, T); the grid ends where the shortest log does.
 
         Raises:
-            KeyError: If it was not measured.
+            NotMeasuredError: If it was not measured.
         """
-        logs = self._logs[setting, agent]
         if metric not in self.columns(setting, agent):
-            raise KeyError(f"{metric} of {agent} on {setting}")
+            raise NotMeasuredError(f"{metric} of {agent} on {setting}")
+        logs = self._logs[setting, agent]
         steps = [np.array([row["step"] for row in rows], np.float64) for rows in logs.values()]
         values = [
             np.array([np.nan if row[metric] is None else row[metric] for row in rows], np.float64)
@@ -126,11 +134,11 @@ class Evidence:
 
     def solved(self, setting: str, agent: str) -> np.ndarray:
         """Return which seeds succeed at the end, (S,)."""
-        return self.final(setting, agent, "test_success") >= SOLVED
+        return self.final(setting, agent, "test_success") >= SOLVED - _ROUNDING
 
     def solved_once(self, setting: str, agent: str) -> np.ndarray:
         """Return which seeds succeed at their best, (S,)."""
-        return self.best(setting, agent, "test_success") >= SOLVED
+        return self.best(setting, agent, "test_success") >= SOLVED - _ROUNDING
 
     def steps_until_solved(self, setting: str, agent: str) -> np.ndarray:
         """Return the step at which each seed first succeeds in a row of evaluations, (S,).
@@ -138,7 +146,7 @@ class Evidence:
         Those that never do count with the length of training: a lower bound.
         """
         steps, values = self.curves(setting, agent, "test_success")
-        reached = running_mean(values, IN_A_ROW) >= SOLVED
+        reached = running_mean(values, IN_A_ROW) >= SOLVED - _ROUNDING
         reached[:, : IN_A_ROW - 1] = False
         return np.where(reached.any(1), steps[reached.argmax(1)], steps[-1])
 
@@ -165,6 +173,11 @@ class Evidence:
             )
         return np.min(counts, axis=0)
 
+    def succeeded(self, setting: str, agent: str) -> np.ndarray:
+        """Return which seeds ever succeeded in training, (S,)."""
+        _, success = self.curves(setting, agent, "train_success")
+        return np.any(success > 0, axis=1)
+
     def _best_test_return(self, setting: str) -> float:
         """Return the highest test return of any agent, which the swings are measured by."""
         agents = [one.name for one in self.experiment.agents if self.has(setting, one.name)]
@@ -181,7 +194,7 @@ class Evidence:
         """Return each seed's entropy on the first third of the way less that on the last, (S,)."""
         profile = self.profile(setting, agent)
         if profile is None:
-            raise KeyError(f"profile of {agent} on {setting}")
+            raise NotMeasuredError(f"profile of {agent} on {setting}")
         third = len(profile[0]) // 3
         return profile[1][:, :third].mean(1) - profile[1][:, -third:].mean(1)
 

@@ -73,6 +73,10 @@ class Finding:
     measured: str
 
 
+class NotMeasuredError(LookupError):
+    """What a check asks for is not among the results."""
+
+
 @dataclass(frozen=True)
 class Check:
     """One line of an experiment's rule: a statement and how to test it."""
@@ -139,10 +143,17 @@ class Experiment:
         """
         if not evidence.complete:
             return NOT_MEASURED, [Finding(None, "runs are missing") for _ in self.checks]
-        findings = [check.test(evidence) for check in self.checks]
+        findings = [_test(check, evidence) for check in self.checks]
         if any(finding.holds is None for finding in findings):
             return NOT_MEASURED, findings
         held = [finding.holds for finding in findings]
         if all(held):
             return REPRODUCED, findings
         return (PARTLY if any(held) else NOT_REPRODUCED), findings
+
+
+def _test(check: Check, evidence: Evidence) -> Finding:
+    try:
+        return check.test(evidence)
+    except NotMeasuredError as error:
+        return Finding(None, f"{error} was not measured")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from sb3_flowpolicy.experiments.comparisons import at_least_times
+from sb3_flowpolicy.experiments.counts import solved
 from sb3_flowpolicy.experiments.experiment import (
     FLOW,
     GAUSS,
@@ -12,7 +14,6 @@ from sb3_flowpolicy.experiments.experiment import (
     Experiment,
     Setting,
 )
-from sb3_flowpolicy.experiments.rules import at_least_times, solved
 
 _PINK = {"action_noise_color": 1.0}
 

@@ -9,8 +9,8 @@ import numpy as np
 from sb3_flowpolicy.diagnostics.figures import new_figure
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
-from sb3_flowpolicy.experiments.rules import WORDS
 from sb3_flowpolicy.experiments.statistics import interquartile_curve, running_mean
+from sb3_flowpolicy.experiments.tables import WORDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

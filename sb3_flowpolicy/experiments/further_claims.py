@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sb3_flowpolicy.experiments.comparisons import about_equal, at_least_times, ordered, reaches
 from sb3_flowpolicy.experiments.experiment import (
     AGENTS,
     FLOW,
@@ -10,7 +11,6 @@ from sb3_flowpolicy.experiments.experiment import (
     Experiment,
     Setting,
 )
-from sb3_flowpolicy.experiments.rules import about_equal, at_least_times, ordered, reaches
 
 _GAUSS_AND_FLOW = (GAUSS, FLOW)
 _SQUARE_STEPS = 200_000

@@ -10,8 +10,8 @@ import plotly.graph_objects as go
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
 from sb3_flowpolicy.experiments.figures import colour, smoothed
-from sb3_flowpolicy.experiments.rules import WORDS
 from sb3_flowpolicy.experiments.statistics import interquartile_curve
+from sb3_flowpolicy.experiments.tables import WORDS
 
 
 def curves_plot(evidence: Evidence, setting: str, metric: str) -> go.Figure:

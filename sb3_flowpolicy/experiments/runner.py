@@ -17,7 +17,8 @@ from filelock import FileLock, Timeout
 
 from sb3_flowpolicy.experiments.costs import item_seconds
 from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
+from sb3_flowpolicy.experiments.settings_file import claim_folder
+from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import Plan, WorkItem
 
 # Read by OpenMP and numba when a process starts: one thread each, as many processes as cores.

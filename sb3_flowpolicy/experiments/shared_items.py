@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from sb3_flowpolicy.benchmarks.report import machine
-from sb3_flowpolicy.experiments.store import ItemFiles, read_json
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
+from sb3_flowpolicy.experiments.settings_file import read_settings
+from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import WorkItem, describe
 
 # How an experiment calls an item; the rest of its description is what it does.
@@ -21,7 +23,8 @@ def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
 
     The same is: equal in everything that results depend on, at the same commit, with the same
     versions. Where the commit is not known, or source files differ from it, nothing is copied;
-    neither is an item whose files are not as long as they were when it was finished.
+    neither is an item that was begun or continued at another commit, or whose files are not what
+    they were when it was finished.
 
     Args:
         folder: Folder of the experiment, claimed; others lie beside it.
@@ -31,29 +34,30 @@ def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
         Key of each copied item to the experiment that it came from.
 
     Raises:
-        ValueError: If a settings file beside the folder is corrupt; the message names it.
+        ValueError: If a file of another experiment is corrupt; the message names it.
     """
     here = machine()
     adopted: dict[str, str] = {}
     if here["commit"] is None or here["commit"].endswith("-dirty"):
         return adopted
     wanted = {_work(describe(item)): item.key for item in items}
-    for path in sorted(folder.parent.glob("*/settings.json")):
-        if path.parent == folder:
-            continue
-        for key, described in read_json(path).get("items", {}).items():
+    for other in EXPERIMENTS:  # other folders beside this one are none of our business
+        settings = None if other == folder.name else read_settings(folder.parent / other)
+        for key, described in (settings or {"items": {}})["items"].items():
             mine = wanted.get(_work(described))
             if mine is None or mine in adopted:
                 continue
-            there = ItemFiles(path.parent, key)
+            there = ItemFiles(folder.parent / other, key)
             done = there.read_done()
-            if done is None:
-                continue
-            same_code = all(done["machine"][name] == here[name] for name in ("commit", "versions"))
-            if same_code and there.lengths() == {k: done.get(k) for k in there.lengths()}:
+            if done is not None and _same_code(done, here) and there.damage(done) is None:
                 _copy(there, ItemFiles(folder, mine), done)
-                adopted[mine] = path.parent.name
+                adopted[mine] = other
     return adopted
+
+
+def _same_code(done: dict[str, Any], here: dict[str, Any]) -> bool:
+    commits = done.get("commits", [done["machine"]["commit"]])
+    return commits == [here["commit"]] and done["machine"]["versions"] == here["versions"]
 
 
 def _work(described: dict[str, Any]) -> str:

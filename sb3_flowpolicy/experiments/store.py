@@ -1,4 +1,4 @@
-"""Results on disk: append-only files per work item, and a folder that keeps to one setting.
+"""Results on disk: append-only files per work item.
 
 A folder holds, per experiment, ``settings.json`` and three files per item:
 
@@ -13,14 +13,16 @@ and ``checkpoints/KEY`` while the item is unfinished.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from sb3_flowpolicy.experiments.json_files import read_json, require, write_json
 
 BASIC_COLUMNS = (
     "seed",
@@ -34,6 +36,25 @@ BASIC_COLUMNS = (
     "ent_coef",
 )
 Row = dict[str, float | None]
+
+DONE_FIELDS = {
+    **{"steps": int, "seeds": list, "table": int, "details": int},
+    **{"cpu_seconds": (int, float), "steps_per_second": (int, float)},
+    "machine": {
+        **{"commit": (str, type(None)), "cpu_count": (int, type(None))},
+        **{"processor": str, "python": str, "versions": dict},
+    },
+}
+"""What ``KEY.done.json`` holds, see :func:`~sb3_flowpolicy.experiments.json_files.require`."""
+
+DETAIL_FIELDS = {
+    "profile": {"seed": int, "way": list, "entropy": list},
+    "picture": {
+        **{"seed": int, "step": int, "steps": list},
+        **{"positions": list, "samples": list, "trail": list},
+    },
+}
+"""Kinds of lines in ``KEY.details.jsonl``, and what each holds."""
 
 
 class ItemFiles:
@@ -68,27 +89,54 @@ class ItemFiles:
         """Append one object."""
         _append(self.details, json.dumps(detail, separators=(",", ":")) + "\n")
 
-    def lengths(self) -> dict[str, int]:
-        """Return how long the files are: what a checkpoint has to remember."""
-        paths = {"table": self.table, "details": self.details}
-        return {name: path.stat().st_size if path.exists() else 0 for name, path in paths.items()}
+    def fingerprint(self) -> dict[str, Any]:
+        """Return length and contents, in short: what a checkpoint has to remember."""
+        digest = hashlib.sha256()
+        lengths = {}
+        for name, path in self._paths().items():
+            lengths[name] = path.stat().st_size if path.exists() else 0
+            if lengths[name]:  # devices have no length, and some no end
+                digest.update(path.read_bytes())
+        return {**lengths, "sha256": digest.hexdigest()}
 
-    def cut_to(self, lengths: Mapping[str, int]) -> None:
+    def damage(self, noted: Mapping[str, Any]) -> str | None:
+        """Say how the files differ from what they were.
+
+        Args:
+            noted: What :meth:`fingerprint` returned; results of old have no ``sha256``.
+
+        Returns:
+            A sentence; None if they are the same.
+        """
+        found = self.fingerprint()
+        for name, path in self._paths().items():
+            if found[name] != noted[name]:
+                return f"{path} must hold the {noted[name]} bytes written to it, got {found[name]}"
+        if found["sha256"] != noted.get("sha256", found["sha256"]):
+            return f"{self.table} and {self.details} must hold what was written, got something else"
+        return None
+
+    def cut_to(self, noted: Mapping[str, Any]) -> None:
         """Drop what was written after a checkpoint, half a line perhaps.
 
+        Args:
+            noted: What :meth:`fingerprint` returned then.
+
         Raises:
-            ValueError: If a file is shorter than it was at the checkpoint.
+            ValueError: If the files hold less than they did, or something else.
         """
-        for name, path in {"table": self.table, "details": self.details}.items():
-            size = path.stat().st_size if path.exists() else 0
-            if size < lengths[name]:
-                raise ValueError(
-                    f"{path} must hold the {lengths[name]} bytes that were there at the last "
-                    f"checkpoint, got {size}: restore it, or delete {self.checkpoints} and "
-                    f"{self.table} to repeat this item"
-                )
-            if size > lengths[name]:
-                os.truncate(path, lengths[name])
+        for name, path in self._paths().items():
+            if path.exists() and path.stat().st_size > noted[name]:
+                os.truncate(path, noted[name])
+        damage = self.damage(noted)
+        if damage:
+            raise ValueError(
+                f"{damage}: restore it, or delete {self.checkpoints} and {self.table} to repeat "
+                "this item"
+            )
+
+    def _paths(self) -> dict[str, Path]:
+        return {"table": self.table, "details": self.details}
 
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Declare the item complete and drop its checkpoints."""
@@ -136,10 +184,13 @@ class ItemFiles:
                 raise ValueError(
                     f"{self.details}, line {number} must be JSON, got {line[:60]!r}: {_ADVICE}"
                 ) from error
-            if not isinstance(detail, dict):
+            where = f"{self.details}, line {number}"
+            require(where, detail, {"kind": str})
+            if detail["kind"] not in DETAIL_FIELDS:
                 raise ValueError(
-                    f"{self.details}, line {number} must be an object, got {line[:60]!r}: {_ADVICE}"
+                    f"{where} must be of a kind among {[*DETAIL_FIELDS]}, got {detail['kind']!r}"
                 )
+            require(where, detail, DETAIL_FIELDS[detail["kind"]])
             found.append(detail)
         return found
 
@@ -149,7 +200,7 @@ class ItemFiles:
         Raises:
             ValueError: If the file is corrupt.
         """
-        return read_json(self.done) if self.finished else None
+        return read_json(self.done, DONE_FIELDS) if self.finished else None
 
 
 _ADVICE = "restore the file, or delete all files of this item and run it again"
@@ -189,79 +240,3 @@ def _append(path: Path, text: str) -> None:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a file at once or not at all."""
-    write_text(path, json.dumps(content, indent=1) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file at once or not at all."""
-    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)  # mkstemp's files are for their owner alone
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read an object.
-
-    Raises:
-        ValueError: If the file holds none.
-    """
-    try:
-        content = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} must be JSON, got an error in line {error.lineno}") from error
-    except (ValueError, RecursionError) as error:  # other encodings, a hundred thousand brackets
-        raise ValueError(f"{path} must be JSON, got {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold an object, got {type(content).__name__}")
-    return content
-
-
-def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Make a folder belong to these settings, or check that it does.
-
-    Raises:
-        ValueError: If it holds results of other settings; the message names the differences.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "settings.json"
-    wanted = json.loads(json.dumps(settings))
-    if not path.exists():
-        strays = [one.name for one in folder.glob("*.csv")]
-        if strays:
-            raise ValueError(f"{folder} must be new or have its settings.json, got only {strays}")
-        return write_json(path, settings)
-    found = read_json(path)
-    if found != wanted:
-        differences = "; ".join(_differences(found, wanted)[:5])
-        raise ValueError(
-            f"{folder} must hold results of the same settings, got others ({differences}). "
-            "Choose another folder with --out, or run with the settings it was made with"
-        )
-
-
-def _differences(found: Any, wanted: Any, where: str = "") -> list[str]:
-    """Say in which leaves two nested objects differ."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        parts = []
-        for key in sorted(found.keys() | wanted.keys()):
-            place = f"{where}.{key}" if where else key
-            parts += _differences(found.get(key), wanted.get(key), place)
-        return parts
-    if found == wanted:
-        return []
-    return [f"{where}: there {_short(found)}, now {_short(wanted)}"]
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.rules import WORDS
 from sb3_flowpolicy.experiments.statistics import interquartile_mean
 from sb3_flowpolicy.experiments.work import FIRST_SEED
+
+WORDS = {
+    "train_return": "training return",
+    "train_success": "training success",
+    "test_return": "test return",
+    "test_success": "test success",
+    "entropy": "entropy",
+    "ent_coef": "temperature",
+    "same_axis_correlation": "correlation of same-axis actions",
+}
+"""How metrics are called in sentences."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +109,17 @@ def facts(evidence: Evidence) -> dict[str, str]:
             f"{hours:.2f} core hours; {min(speeds):,.0f} to {max(speeds):,.0f} steps per second "
             "and process, seeds summed"
         )
-        found["commit"] = ", ".join(sorted({str(one["machine"]["commit"]) for one in done}))
+        found["commit"] = ", ".join(
+            sorted({str(commit) for one in done for commit in _commits(one)})
+        )
         versions = machine["versions"]
         found["machine"] = (
             f"{machine['cpu_count']} cores {machine['processor']}, Python {machine['python']}, "
             + ", ".join(f"{k} {versions[k]}" for k in ("torch", "stable_baselines3", "gymnasium"))
         )
     return found
+
+
+def _commits(done: dict[str, Any]) -> list[str | None]:
+    """Return the commits of all sessions; results of old name that of the last."""
+    return done.get("commits", [done["machine"]["commit"]])

@@ -12,6 +12,7 @@ import torch as th
 from filelock import FileLock, Timeout
 
 from sb3_flowpolicy.benchmarks.report import machine
+from sb3_flowpolicy.experiments.json_files import read_json, write_json
 from sb3_flowpolicy.experiments.measures import (
     MEASURES,
     TRAINING_INFOS,
@@ -21,7 +22,7 @@ from sb3_flowpolicy.experiments.measures import (
     policy_picture,
 )
 from sb3_flowpolicy.experiments.separate_seeds import SeparateSeeds
-from sb3_flowpolicy.experiments.store import ItemFiles, Row, read_json, write_json
+from sb3_flowpolicy.experiments.store import ItemFiles, Row
 from sb3_flowpolicy.experiments.work import WorkItem, environment
 from sb3_flowpolicy.sac_flow import UPDATES_WORTH_COMPILING, SACFlow
 from sb3_flowpolicy.seed_batch import SeedBatch
@@ -33,6 +34,10 @@ Report = Callable[[str, int], None]
 _ALL_EPISODES = 10**7
 # An interrupted run's processes end within moments of each other.
 _LOCK_SECONDS = 20
+_STATE_FIELDS = {
+    **{"step": int, "sessions": int, "commits": list, "files": {"table": int, "details": int}},
+    **{"seconds": (int, float), "cpu_seconds": (int, float)},
+}
 
 
 def run_item(item: WorkItem, folder: Path, report: Report) -> None:
@@ -70,6 +75,9 @@ class _Training:
         self.started = time.perf_counter()
         self.cpu_started = time.process_time()
         self.seconds_before, self.cpu_before, self.sessions = 0.0, 0.0, 1
+        # Now, not at the end: by then the files on disk may be of another commit.
+        self.machine = machine()
+        self.commits = [self.machine["commit"]]
         self.done_steps = 0
         self.batch = self._resume() or self._begin()
         self.tests = DeterministicEpisodes(self.env, len(item.seeds), item.test_episodes)
@@ -128,14 +136,26 @@ class _Training:
         found = sorted(self.files.checkpoints.glob("step_*"))
         if not found:
             return None
-        state = read_json(found[-1] / "state.json")
-        self.files.cut_to(state["lengths"])
+        state = read_json(found[-1] / "state.json", _STATE_FIELDS)
+        self.files.cut_to(state["files"])
         self.done_steps = state["step"]
         self.seconds_before, self.cpu_before = state["seconds"], state["cpu_seconds"]
         self.sessions = state["sessions"] + 1
+        self.commits = [*state["commits"], *self.commits]
+        try:
+            return self._load(found[-1])
+        except MemoryError:
+            raise
+        except Exception as error:  # whatever torch, pickle and zip say about half a file
+            raise ValueError(
+                f"{found[-1]} must hold a whole checkpoint, got {type(error).__name__} ({error}): "
+                f"delete {self.files.checkpoints} and {self.files.table} to repeat this item"
+            ) from error
+
+    def _load(self, checkpoint: Path) -> SeedBatch | SeparateSeeds:
         if self._one_by_one:
-            return SeparateSeeds.load(found[-1], self.env, self.item.seeds, self._infos())
-        return SeedBatch.load(found[-1], self.env, info_keywords=self._infos())
+            return SeparateSeeds.load(checkpoint, self.env, self.item.seeds, self._infos())
+        return SeedBatch.load(checkpoint, self.env, info_keywords=self._infos())
 
     def _save(self) -> None:
         folder = self.files.checkpoints
@@ -145,10 +165,11 @@ class _Training:
         self.batch.save(partial)
         state = {
             "step": self.done_steps,
-            "lengths": self.files.lengths(),
+            "files": self.files.fingerprint(),
             "seconds": self._seconds(),
             "cpu_seconds": self._cpu_seconds(),
             "sessions": self.sessions,
+            "commits": self.commits,
         }
         write_json(partial / "state.json", state)
         older = list(folder.glob("step_*"))
@@ -210,8 +231,9 @@ class _Training:
             "cpu_seconds": round(self._cpu_seconds(), 1),
             "steps_per_second": round(self.done_steps * len(self.item.seeds) / seconds, 1),
             "sessions": self.sessions,
-            **self.files.lengths(),
-            "machine": machine(),
+            "commits": list(dict.fromkeys(self.commits)),
+            **self.files.fingerprint(),
+            "machine": self.machine,
         }
 
 

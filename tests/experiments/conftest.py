@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sb3_flowpolicy.experiments.counts import mostly_fails, none_fails
 from sb3_flowpolicy.experiments.experiment import FLOW, GAUSS, Experiment, Setting
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
-from sb3_flowpolicy.experiments.rules import mostly_fails, none_fails
-from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
+from sb3_flowpolicy.experiments.settings_file import claim_folder
+from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import Plan, make_plan
 
 FAST = {
@@ -107,5 +109,15 @@ def _write_item(files: ItemFiles, item, level: float) -> None:
         "versions": versions,
     }
     files.finish(
-        {"seconds": 60.0, "cpu_seconds": 50.0, "steps_per_second": 100.0, "machine": machine}
+        {
+            **{"steps": item.steps, "seeds": list(item.seeds), "seconds": 60.0},
+            **{"cpu_seconds": 50.0, "steps_per_second": 100.0, "machine": machine},
+            **files.fingerprint(),
+        }
     )
+
+
+def declare_whole(files: ItemFiles) -> None:
+    """Say of files that a test has changed that they are as the run left them."""
+    done = json.loads(files.done.read_text())
+    files.done.write_text(json.dumps({**done, **files.fingerprint()}))

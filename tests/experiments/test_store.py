@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, claim_folder, write_json
+from sb3_flowpolicy.experiments.json_files import write_json
+from sb3_flowpolicy.experiments.settings_file import claim_folder
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles
 
 ROW = dict.fromkeys(BASIC_COLUMNS, 0.25) | {"seed": 1, "step": 100, "train_success": None}
 
@@ -38,7 +40,7 @@ def test_a_corrupt_line_is_named(files: ItemFiles, line: str) -> None:
 
 
 def test_a_corrupt_detail_is_named(files: ItemFiles) -> None:
-    files.append_detail({"kind": "profile"})
+    files.append_detail({"kind": "profile", "seed": 1, "way": [], "entropy": []})
     with open(files.details, "a") as file:
         file.write("{oops\n")
     with pytest.raises(ValueError, match=r"details\.jsonl, line 2 must be JSON"):
@@ -46,11 +48,11 @@ def test_a_corrupt_detail_is_named(files: ItemFiles) -> None:
 
 
 def test_half_a_line_is_not_read_and_goes_when_the_run_goes_on(files: ItemFiles) -> None:
-    whole, lengths = files.table.read_bytes(), files.lengths()
+    whole, noted = files.table.read_bytes(), files.fingerprint()
     with open(files.table, "a") as file:
         file.write("1,300,0.1")
     assert len(files.read_rows()) == 3
-    files.cut_to(lengths)
+    files.cut_to(noted)
     assert files.table.read_bytes() == whole
     with open(files.table, "a") as file:
         file.write("1,300,0.1")
@@ -60,10 +62,10 @@ def test_half_a_line_is_not_read_and_goes_when_the_run_goes_on(files: ItemFiles)
 
 
 def test_lines_that_vanished_are_noticed(files: ItemFiles) -> None:
-    lengths = files.lengths()
+    noted = files.fingerprint()
     files.table.write_text("")
     with pytest.raises(ValueError, match=r"circle-flow\.csv must hold the \d+ bytes"):
-        files.cut_to(lengths)
+        files.cut_to(noted)
 
 
 def test_nothing_infinite_is_written(files: ItemFiles) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+from sb3_flowpolicy.benchmarks.report import machine
 from sb3_flowpolicy.experiments import training
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.store import ItemFiles
@@ -100,6 +101,63 @@ def test_interrupted_runs_end_with_the_same_results(
     done = files.read_done()
     assert done is not None
     assert done["steps"] == 120
+
+
+def _interrupt(item: WorkItem, folder: Path) -> ItemFiles:
+    """Leave an item after its second checkpoint."""
+
+    def crash(key: str, step: int) -> None:
+        if step >= 60:
+            raise Crash
+
+    with pytest.raises(Crash):
+        run_item(item, folder, crash)
+    return ItemFiles(folder, item.key)
+
+
+def test_all_commits_of_a_run_are_noted(
+    item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "machine", lambda: {**machine(), "commit": "abc-dirty"})
+    files = _interrupt(item, tmp_path)
+    monkeypatch.setattr(training, "machine", lambda: {**machine(), "commit": "def"})
+    run_item(item, tmp_path, quiet)
+    done = files.read_done()
+    assert done is not None
+    assert done["commits"] == ["abc-dirty", "def"]
+    assert done["machine"]["commit"] == "def"
+
+
+def test_a_number_changed_behind_a_checkpoint_is_noticed(item: WorkItem, tmp_path: Path) -> None:
+    files = _interrupt(item, tmp_path)
+    text = files.table.read_text()
+    files.table.write_text(text.replace("1,20,", "1,21,", 1))
+    with pytest.raises(ValueError, match="must hold what was written, got something else"):
+        run_item(item, tmp_path, quiet)
+    files.table.write_text(text)
+    run_item(item, tmp_path, quiet)
+    assert files.finished
+
+
+@pytest.mark.parametrize("overrides", [{}, GSDE], ids=["batch", "separate"])
+def test_half_a_checkpoint_is_named(
+    overrides: dict[str, Any], item: WorkItem, tmp_path: Path
+) -> None:
+    hyperparameters = merge(item.hyperparameters, overrides)
+    item = replace(item, hyperparameters=hyperparameters, measures=(), pictures_at=())
+    files = _interrupt(item, tmp_path)
+    for path in (path for path in files.checkpoints.rglob("*") if path.suffix != ".json"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(ValueError, match=r"step_0+\d+ must hold a whole checkpoint, got"):
+        run_item(item, tmp_path, quiet)
+
+
+def test_a_state_without_its_fields_is_named(item: WorkItem, tmp_path: Path) -> None:
+    files = _interrupt(item, tmp_path)
+    next(files.checkpoints.glob("step_*/state.json")).write_text("{}")
+    with pytest.raises(ValueError, match=r"state\.json must hold 'step' \(int\), got {}"):
+        run_item(item, tmp_path, quiet)
 
 
 def test_a_crash_while_saving_leaves_the_last_checkpoint(

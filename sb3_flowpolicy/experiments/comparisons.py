@@ -1,65 +1,22 @@
-"""The checks that rules are made of. Each states what it demands and shows what it found."""
+"""Checks that compare agents by what they end with."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-import numpy as np
-
-from sb3_flowpolicy.experiments.evidence import SWINGS_OF_AN_OSCILLATION, Evidence
+from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent, Check, Finding
 from sb3_flowpolicy.experiments.statistics import interquartile_mean, probability_of_improvement
-
-WORDS = {
-    "train_return": "training return",
-    "train_success": "training success",
-    "test_return": "test return",
-    "test_success": "test success",
-    "entropy": "entropy",
-    "ent_coef": "temperature",
-    "same_axis_correlation": "correlation of same-axis actions",
-}
-"""How metrics are called in sentences."""
-
-
-def solved(setting: str, agent: Agent, share: float, at_best: bool = False) -> Check:
-    """Demand that at least this share of the seeds solves the task."""
-    when = "at its best" if at_best else "at the end"
-    return Check(
-        f"{setting}: {agent.label} solves the task {when} in at least {share:.0%} of the seeds",
-        _counted(setting, agent, at_best, lambda found: found.mean() >= share - 1e-9),
-    )
-
-
-def mostly_fails(setting: str, agent: Agent, share: float) -> Check:
-    """Demand that at most this share of the seeds solves the task at the end."""
-    return Check(
-        f"{setting}: {agent.label} solves the task at the end in at most {share:.0%} of the seeds",
-        _counted(setting, agent, False, lambda found: found.mean() <= share + 1e-9),
-    )
-
-
-def none_fails(setting: str, agent: Agent) -> Check:
-    """Demand that every seed solves the task at the end."""
-    return Check(
-        f"{setting}: no seed of {agent.label} fails",
-        _counted(setting, agent, False, lambda found: bool(found.all())),
-    )
-
-
-def _counted(
-    setting: str, agent: Agent, at_best: bool, judge: Callable[[np.ndarray], bool]
-) -> Callable[[Evidence], Finding]:
-    def test(evidence: Evidence) -> Finding:
-        found = (evidence.solved_once if at_best else evidence.solved)(setting, agent.name)
-        return Finding(bool(judge(found)), f"{found.sum()} of {len(found)}")
-
-    return test
+from sb3_flowpolicy.experiments.tables import WORDS
 
 
 def ordered(setting: str, metric: str, agents: Sequence[Agent], margin: float = 0.0) -> Check:
-    """Demand that the final value falls from agent to agent, by at least ``margin`` each."""
+    """Demand that the final value falls from agent to agent, by at least ``margin`` each.
+
+    And that it is no accident: that of each pair a run of the first is likely to end above one of
+    the second, the 95 % interval of the probability lying above one half.
+    """
     names = " > ".join(agent.label for agent in agents)
     by = f", by at least {margin:g} each" if margin else ""
 
@@ -73,13 +30,18 @@ def ordered(setting: str, metric: str, agents: Sequence[Agent], margin: float = 
             float(more.value - less.value) > margin for more, less in itertools.pairwise(means)
         )
         return Finding(
-            falls,
+            falls and all(bool(chance.low > 0.5) for chance in chances),
             "; ".join(f"{a.label} {m:.2f}" for a, m in zip(agents, means, strict=True))
             + "; probability of improvement "
-            + ", ".join(f"{float(chance.value):.2f}" for chance in chances),
+            + ", ".join(f"{chance:.2f}" for chance in chances),
         )
 
-    return Check(f"{setting}: final {WORDS.get(metric, metric)} (IQM) {names}{by}", test)
+    words = WORDS.get(metric, metric)
+    return Check(
+        f"{setting}: final {words} (IQM) {names}{by} (and probability of improvement above one "
+        "half, by its 95 % interval)",
+        test,
+    )
 
 
 def about_equal(setting: str, metric: str, agents: Sequence[Agent], tolerance: float) -> Check:
@@ -120,49 +82,34 @@ def at_least_times(setting: str, metric: str, more: Agent, less: Agent, factor: 
 
 
 def slower(setting: str, slow: Agent, others: Sequence[Agent]) -> Check:
-    """Demand that one agent needs more steps until it solves the task than each other one."""
+    """Demand that one agent is likely to need more steps until it solves the task than others.
+
+    Likely: the 95 % interval of the probability lies above one half. Means that differ by less
+    than their intervals are wide show nothing.
+    """
     names = " and ".join(agent.label for agent in others)
 
     def test(evidence: Evidence) -> Finding:
-        means = {
-            agent.label: interquartile_mean(evidence.steps_until_solved(setting, agent.name))
+        steps = {
+            agent.label: evidence.steps_until_solved(setting, agent.name)
             for agent in (slow, *others)
         }
-        holds = all(means[slow.label].value > means[other.label].value for other in others)
-        return Finding(holds, "; ".join(f"{label} {mean:,.0f}" for label, mean in means.items()))
-
-    return Check(f"{setting}: {slow.label} needs more steps (IQM) to solve it than {names}", test)
-
-
-def oscillates(setting: str, agent: Agent, share: float) -> Check:
-    """Demand that at least this share of the seeds oscillates."""
-    return Check(
-        f"{setting}: {agent.label} oscillates (at least {SWINGS_OF_AN_OSCILLATION} swings in "
-        f"return, entropy and temperature) in at least {share:.0%} of the seeds",
-        _swinging(setting, agent, lambda flags: flags.mean() >= share - 1e-9),
-    )
-
-
-def is_steady(setting: str, agent: Agent, share: float) -> Check:
-    """Demand that at most this share of the seeds oscillates."""
-    return Check(
-        f"{setting}: {agent.label} oscillates in at most {share:.0%} of the seeds",
-        _swinging(setting, agent, lambda flags: flags.mean() <= share + 1e-9),
-    )
-
-
-def _swinging(
-    setting: str, agent: Agent, judge: Callable[[np.ndarray], bool]
-) -> Callable[[Evidence], Finding]:
-    def test(evidence: Evidence) -> Finding:
-        counts = evidence.oscillations(setting, agent.name)
-        flags = counts >= SWINGS_OF_AN_OSCILLATION
-        swings = ", ".join(str(count) for count in counts)
+        chances = {
+            other.label: probability_of_improvement(steps[slow.label], steps[other.label])
+            for other in others
+        }
+        means = "; ".join(f"{k} {interquartile_mean(v):,.0f}" for k, v in steps.items())
+        more = ", ".join(f"{label} {chance:.2f}" for label, chance in chances.items())
         return Finding(
-            bool(judge(flags)), f"{flags.sum()} of {len(flags)} (swings per seed: {swings})"
+            all(bool(chance.low > 0.5) for chance in chances.values()),
+            f"{means}; probability of more steps than {more}",
         )
 
-    return test
+    return Check(
+        f"{setting}: {slow.label} needs more steps to solve it than {names} (probability above one "
+        "half, by its 95 % interval)",
+        test,
+    )
 
 
 def front_loads(setting: str, agent: Agent, than: Agent, margin: float) -> Check:

@@ -1,0 +1,80 @@
+"""JSON files that are whole or not there, and that hold what a reader takes for granted."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a file at once or not at all."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file at once or not at all."""
+    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w") as file:
+            file.write(text)
+        os.chmod(temporary, 0o644)  # mkstemp's files are for their owner alone
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def read_json(path: Path, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Read an object.
+
+    Args:
+        path: File to read.
+        fields: What it has to hold, see :func:`require`.
+
+    Raises:
+        ValueError: If the file holds no object, or one without these fields.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} must be JSON, got an error in line {error.lineno}") from error
+    except (ValueError, RecursionError) as error:  # other encodings, a hundred thousand brackets
+        raise ValueError(f"{path} must be JSON, got {error}") from error
+    require(str(path), content, fields or {})
+    return content
+
+
+def require(where: str, content: Any, fields: Mapping[str, Any]) -> None:
+    """Check that ``content`` is an object with these fields.
+
+    Args:
+        where: File, and place in it, for the message.
+        content: What was read.
+        fields: Name to type, or to the fields of a nested object.
+
+    Raises:
+        ValueError: If a field is missing or of another type.
+
+    Example:
+        >>> require("done.json", {"steps": 3, "machine": {}}, {"steps": int, "machine": dict})
+        >>> require("done.json", {"machine": {}}, {"machine": {"commit": str}})
+        Traceback (most recent call last):
+        ...
+        ValueError: done.json: machine must hold 'commit' (str), got {}
+    """
+    if not isinstance(content, dict):
+        raise ValueError(f"{where} must hold an object, got {type(content).__name__}")
+    for name, kind in fields.items():
+        value = content.get(name)
+        if isinstance(kind, Mapping):
+            require(f"{where}: {name}", value, kind)
+        elif not isinstance(value, kind):
+            kinds = kind if isinstance(kind, tuple) else (kind,)
+            wanted = " or ".join(one.__name__ for one in kinds)
+            found = json.dumps(value if name in content else content)
+            short = found if len(found) <= 60 else found[:57] + "..."
+            raise ValueError(f"{where} must hold {name!r} ({wanted}), got {short}")

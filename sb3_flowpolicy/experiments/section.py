@@ -1,0 +1,142 @@
+"""What there is to say about one experiment, for the page and for the docs."""
+
+from __future__ import annotations
+
+import functools
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_flowpolicy.experiments import evidence as definitions
+from sb3_flowpolicy.experiments.costs import in_words, plan_seconds
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.experiment import Finding
+from sb3_flowpolicy.experiments.figures import SMOOTHED_OVER, curves_figure, panels, profile_figure
+from sb3_flowpolicy.experiments.integrity import reservation
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
+from sb3_flowpolicy.experiments.outcomes import outcomes_figure
+from sb3_flowpolicy.experiments.policy_pictures import policies_figure
+from sb3_flowpolicy.experiments.statistics import RESAMPLES
+from sb3_flowpolicy.experiments.tables import Table, facts, results_table
+from sb3_flowpolicy.experiments.work import make_plan
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+METHOD = (
+    "Every seed is drawn and counted; none is dropped. Numbers are interquartile means over seeds "
+    "with 95 % stratified bootstrap intervals in brackets (rliable, "
+    f"{RESAMPLES} resamples). "
+    f"Test episodes are deterministic, at least ten per seed and measurement; on a tunnel, whose "
+    "start is fixed, they are all the same episode. Training numbers average the episodes that "
+    "ended since the last measurement, entropies 256 states of the replay buffer. "
+    f"'Final' is the mean over the last {definitions.FINAL_SHARE:.0%} of the measurements. A seed "
+    f"has solved its task 'at the end' if its final test success is at least "
+    f"{definitions.SOLVED:.0%}, 'at its best' if {definitions.IN_A_ROW} measurements in a row "
+    "average that; a seed that never does counts with the length of training in 'steps until "
+    f"solved'. Oscillations are counted as swings of at least "
+    f"{definitions.OSCILLATIONS['train_return']:.0%} of the highest test return in training "
+    f"return, {definitions.OSCILLATIONS['entropy']:g} nats in entropy and "
+    f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the temperature, from the "
+    "first training success on; the curve with the fewest decides. Logs of unequal length are "
+    "interpolated to a common grid that ends with the shortest. "
+    f"Curves are drawn as means over {SMOOTHED_OVER} measurements. A claim is reproduced if all "
+    "lines of its rule hold, not reproduced if none does, partly reproduced otherwise."
+)
+
+
+class Section:
+    """What the page says about one experiment.
+
+    Args:
+        evidence: Its results.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence, self.experiment = evidence, evidence.experiment
+        self.verdict, self.findings = self.experiment.judge(evidence)
+        self.measured = any(
+            evidence.has(setting.name, agent.name)
+            for setting in self.experiment.settings
+            for agent in self.experiment.agents
+        )
+        self.table: Table | None = results_table(evidence) if self.measured else None
+        self.facts = facts(evidence)
+        self.missing = what_is_missing(self.experiment)
+        self.estimate = in_words(plan_seconds(make_plan(self.experiment), 2))
+        # A try-out must not pass for a result.
+        self.reservation = (
+            reservation(self.experiment, evidence.settings) if evidence.items else None
+        )
+
+    @property
+    def rule(self) -> list[tuple[str, str, Finding]]:
+        """Statements of the rule, each with a mark and what was found."""
+        marks = {True: "holds", False: "fails", None: "open"}
+        return [
+            (check.statement, marks[finding.holds], finding)
+            for check, finding in zip(self.experiment.checks, self.findings, strict=True)
+        ]
+
+    def plots(self) -> list[tuple[str, list[str]]]:
+        """Return the interactive plots as JSON, grouped by setting."""
+        from sb3_flowpolicy.experiments.plots import curves_plot, profile_plot
+
+        if not self.measured:
+            return []
+        groups, metrics = [], panels(self.evidence)
+        for setting in self.experiment.settings:
+            figures = [curves_plot(self.evidence, setting.name, metric) for metric in metrics]
+            profile = profile_plot(self.evidence, setting.name)
+            figures += [] if profile is None else [profile]
+            groups.append((setting.name, [_for_html(f.to_json()) for f in figures if f.data]))
+        return groups
+
+    def pictures(self) -> dict[str, Figure]:
+        """Return the still pictures by name."""
+        if not self.measured:
+            return {}
+        found = {
+            "outcomes": outcomes_figure(self.evidence),
+            "curves": curves_figure(self.evidence),
+            "profile": profile_figure(self.evidence),
+            "policies": policies_figure(self.evidence),
+        }
+        return {name: figure for name, figure in found.items() if figure is not None}
+
+
+def read_results(results: Path) -> list[Evidence]:
+    """Read the results of all experiments.
+
+    Args:
+        results: Folder that ``run`` wrote.
+
+    Raises:
+        ValueError: If the folder holds no results, or a file is corrupt.
+    """
+
+    @functools.cache
+    def one(name: str) -> Evidence | None:
+        if name not in EXPERIMENTS:
+            return None
+        return Evidence(EXPERIMENTS[name], results / name, one)
+
+    found = [evidence for name in EXPERIMENTS if (evidence := one(name)) is not None]
+    if not any(evidence.items for evidence in found):
+        raise ValueError(
+            f"{results} must hold the results of at least one experiment, got none: "
+            "python -m sb3_flowpolicy.experiments run NAME makes some"
+        )
+    return found
+
+
+def png(figure: Any, dpi: int) -> bytes:
+    """Return a figure as the bytes of a PNG file, the same for the same figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=dpi, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _for_html(text: str) -> str:
+    """Keep JSON from closing the element that it stands in."""
+    return text.replace("</", "<\\/")

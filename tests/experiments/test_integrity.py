@@ -1,0 +1,217 @@
+"""Results that are not what they should be are refused, or marked."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sb3_flowpolicy.experiments.__main__ import main
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.experiment import GAUSS, NOT_MEASURED, Experiment
+from sb3_flowpolicy.experiments.integrity import reservation
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
+from sb3_flowpolicy.experiments.settings_file import read_settings
+from sb3_flowpolicy.experiments.store import ItemFiles
+from sb3_flowpolicy.experiments.work import make_plan
+from tests.experiments.conftest import MakeUp, declare_whole
+
+NAME = "circle-narrow"
+
+
+def _without_seed(lines: list[str]) -> list[str]:
+    return [line for line in lines if not line.startswith("2,")]
+
+
+def _without_end(lines: list[str]) -> list[str]:
+    return lines[:-1]
+
+
+def _out_of_order(lines: list[str]) -> list[str]:
+    return [lines[0], lines[2], lines[1], *lines[3:]]
+
+
+def _other_seed(lines: list[str]) -> list[str]:
+    return [*lines[:-1], lines[-1].replace("2,", "7,", 1)]
+
+
+def _half_a_seed(lines: list[str]) -> list[str]:
+    return [*lines[:-1], lines[-1].replace("2,", "1.5,", 1)]
+
+
+def _nothing(lines: list[str]) -> list[str]:
+    return []
+
+
+def _head_only(lines: list[str]) -> list[str]:
+    return lines[:1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_without_seed, "must hold seed 2 up to step 60000, got none"),
+        (_without_end, "must hold seed 2 up to step 60000, got 59500"),
+        (_out_of_order, "must hold increasing steps, seed 1 does not"),
+        (_other_seed, r"must hold seeds \[1, 2\], got 7"),
+        (_half_a_seed, r"must hold seeds \[1, 2\], got 1\.5"),
+        (_nothing, "must hold seed 1 up to step 60000, got none"),
+        (_head_only, "must hold seed 1 up to step 60000, got none"),
+    ],
+)
+def test_rows_that_are_missing_or_odd_are_noticed(
+    change: Callable[[list[str]], list[str]], message: str, make_up: MakeUp, tmp_path: Path
+) -> None:
+    make_up(NAME, seeds=2)
+    files = ItemFiles(tmp_path / NAME, "narrow-flow")
+    files.table.write_text("".join(change(files.table.read_text().splitlines(keepends=True))))
+    declare_whole(files)
+    with pytest.raises(ValueError, match=rf"narrow-flow\.csv {message}"):
+        Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
+
+
+def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up(NAME, seeds=2)
+    table = tmp_path / NAME / "narrow-flow.csv"
+    table.write_text(table.read_text().replace("500,50,", "500,51,", 1))
+    with pytest.raises(ValueError, match="must hold what was written, got something else"):
+        Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
+
+
+@pytest.mark.parametrize(
+    ("file", "drop", "message"),
+    [
+        ("settings.json", "steps", r"settings\.json must hold 'steps' \(int\)"),
+        ("settings.json", "items", r"settings\.json must hold 'items' \(dict\)"),
+        ("narrow-flow.done.json", "steps", r"done\.json must hold 'steps' \(int\)"),
+        ("narrow-flow.done.json", "machine", r"done\.json: machine must hold an object"),
+    ],
+)
+def test_a_missing_field_is_named(
+    file: str,
+    drop: str,
+    message: str,
+    make_up: MakeUp,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    make_up(NAME, seeds=2)
+    path = tmp_path / NAME / file
+    content = json.loads(path.read_text())
+    del content[drop]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        Evidence(find(NAME), tmp_path / NAME)
+    assert main(["report", "--results", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+@pytest.mark.parametrize("line", ['{"kind": "profile"}', '{"kind": "photo"}', "[1]", "{}"])
+def test_a_detail_without_its_fields_is_named(line: str, tmp_path: Path) -> None:
+    files = ItemFiles(tmp_path, "a")
+    files.details.write_text(line + "\n")
+    with pytest.raises(ValueError, match=r"a\.details\.jsonl, line 1 must"):
+        files.read_details()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema": 99}, "must be of schema 1, got 99"),
+        ({"experiment": "move"}, "called like its experiment, 'move', got 'circle-narrow'"),
+        ({"seeds": ["1"]}, r"must hold whole numbers as seeds, got \['1'\]"),
+        ({"items": {"x": {}}}, r"settings\.json: x must hold 'setting' \(str\), got {}"),
+    ],
+)
+def test_settings_of_another_kind_are_refused(
+    change: dict[str, Any], message: str, make_up: MakeUp, tmp_path: Path
+) -> None:
+    make_up(NAME, seeds=2)
+    path = tmp_path / NAME / "settings.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(ValueError, match=message):
+        read_settings(path.parent)
+
+
+def test_results_that_are_not_the_experiments_own_are_marked() -> None:
+    experiment = find(NAME)
+
+    def said(**changes: Any) -> str | None:
+        plan = make_plan(experiment, **changes)
+        return reservation(experiment, json.loads(json.dumps(plan.settings())))
+
+    assert said() is None
+    assert said(seeds=12) is None
+    assert said(seeds_per_item=4) is None
+    assert said(steps=100) == "try-out, not a result"
+    assert said(first_seed=100) == "seeds from 100 on, which are for tuning: not a result"
+    other = json.loads(json.dumps(make_plan(experiment).settings()))
+    other["items"]["narrow-flow"]["hyperparameters"]["gamma"] = 0.5
+    assert reservation(experiment, other) == (
+        "made with other settings (items.narrow-flow.hyperparameters.gamma: there 0.5, now 0.8)"
+    )
+
+
+def test_an_agent_that_was_added_later_leaves_the_claim_open(
+    make_up: MakeUp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_up(NAME, seeds=2)
+    grown = replace(find(NAME), agents=(*find(NAME).agents, replace(GAUSS, name="late")))
+    monkeypatch.setitem(EXPERIMENTS, NAME, grown)
+    evidence = Evidence(grown, tmp_path / NAME)
+    assert grown.judge(evidence)[0] == NOT_MEASURED
+    assert reservation(grown, evidence.settings or {}) == "try-out, not a result"
+
+
+def test_what_was_not_measured_leaves_the_claim_open(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("circle-fixed-entropy")
+    for path in (tmp_path / "circle-fixed-entropy").glob("*.details.jsonl"):
+        path.unlink()
+        declare_whole(ItemFiles(path.parent, path.name.removesuffix(".details.jsonl")))
+    experiment = find("circle-fixed-entropy")
+    verdict, findings = experiment.judge(Evidence(experiment, tmp_path / experiment.name))
+    assert verdict == NOT_MEASURED
+    assert findings[2].measured == "profile of gauss on circle was not measured"
+
+
+def test_three_times_the_bar_reaches_the_bar(make_up: MakeUp, tmp_path: Path) -> None:
+    """0.8 + 0.8 + 0.8 is less than 2.4 in floating point."""
+    make_up(NAME, seeds=2)
+    files = ItemFiles(tmp_path / NAME, "narrow-flow")
+    lines = files.table.read_text().splitlines()
+    for k, line in enumerate(lines[1:], start=1):
+        cells = line.split(",")
+        cells[6] = "0.8"
+        lines[k] = ",".join(cells)
+    files.table.write_text("\n".join(lines) + "\n")
+    declare_whole(files)
+    evidence = Evidence(find(NAME), tmp_path / NAME)
+    assert evidence.solved("narrow", "flow").all()
+    assert evidence.solved_once("narrow", "flow").all()
+    assert evidence.steps_until_solved("narrow", "flow").tolist() == [1500, 1500]
+
+
+def test_who_learns_nothing_is_not_steady(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up(NAME, {"flow": 0.0})
+    _, findings = find(NAME).judge(Evidence(find(NAME), tmp_path / NAME))
+    assert [finding.holds for finding in findings] == [False, True, False]
+    assert "0 of 10 ever succeed in training" in findings[2].measured
+
+
+def test_a_renamed_folder_and_strangers_are_left_alone(tiny: Experiment, tmp_path: Path) -> None:
+    """Beside the experiment's folder, whatever else lies there."""
+    (tmp_path / ".vscode").mkdir()
+    (tmp_path / ".vscode" / "settings.json").write_text('{"editor.fontSize": // comment\n 12}')
+    command = ["run", "tiny", "--out", str(tmp_path), "--workers", "1", "--no-progress"]
+    assert main(command) == 0
+    (tmp_path / "tiny").rename(tmp_path / "mine")
+    assert main(command) == 0
+    done = json.loads((tmp_path / "tiny" / "circle-gauss.done.json").read_text())
+    assert "adopted_from" not in done
+    shutil.copytree(tmp_path / "mine", tmp_path / NAME)
+    assert main(["report", "--results", str(tmp_path)]) == 1
