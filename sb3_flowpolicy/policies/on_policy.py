@@ -23,6 +23,9 @@ from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # Of SB3's normal distributions, which are not built.
 _NOT_OURS = {"use_sde", "log_std_init", "full_std", "use_expln", "squash_output"}
+# Of the loss, by an action's log-probability. PPO's is advantage times ratio; a larger one says
+# only that the policy has left the actions that it is judged by.
+_LARGEST_GRADIENT = 1e6
 
 
 class DensityActorCritic(ActorCriticPolicy):
@@ -125,6 +128,11 @@ class DensityActorCritic(ActorCriticPolicy):
     def evaluate_actions(self, *args: Any, **kwargs: Any) -> Any:
         """Return values, log-probabilities and entropies of stored actions, as SB3's.
 
+        The gradient that comes back through a log-probability is bounded. Close to the edge of the
+        action box float32 has few numbers left, so that a stored action may lie many standard
+        deviations beside the one that was drawn. In a narrow distribution one update can raise its
+        log-probability by a hundred: PPO's ratio is infinite, its gradient NaN.
+
         Raises:
             ValueError: If a log-probability is not finite.
         """
@@ -134,6 +142,8 @@ class DensityActorCritic(ActorCriticPolicy):
                 "observations and weights must be finite to learn from, got log-probabilities "
                 "with NaN or infinity"
             )
+        if found[1].requires_grad:
+            found[1].register_hook(_bounded)
         return found
 
     def _predict(self, *args: Any, **kwargs: Any) -> Any:
@@ -156,6 +166,11 @@ class DensityActorCritic(ActorCriticPolicy):
             share_features_extractor=self.share_features_extractor,
         )
         return data
+
+
+def _bounded(gradient: th.Tensor) -> th.Tensor:
+    """Bound a gradient; NaN is 0 x infinity, of a ratio that PPO has clipped: no gradient."""
+    return gradient.nan_to_num(nan=0.0).clamp(-_LARGEST_GRADIENT, _LARGEST_GRADIENT)
 
 
 def _check_net_arch(net_arch: Any) -> None:

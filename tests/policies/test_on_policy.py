@@ -117,6 +117,24 @@ def test_kl_and_clip_fraction_are_those_of_a_recomputation_in_float64(
 
 
 @BOTH
+def test_a_ratio_beyond_float32_leaves_weights_finite(policy: type[ActorCriticPolicy]) -> None:
+    """As of an action on the very edge, which lies many standard deviations from the drawn one."""
+    model = PPO(policy, Box2D(), n_steps=64, batch_size=64, n_epochs=1, seed=0)
+    model.learn(64)
+    before = model.policy.action_net.state_dict()
+    before = {name: value.clone() for name, value in before.items()}
+    model.rollout_buffer.log_probs[::2] -= 200.0
+    advantages = model.rollout_buffer.advantages
+    assert (advantages[::2] > 0).any()
+    assert (advantages[::2] < 0).any()
+    model.train()
+    after = model.policy.state_dict()
+    assert all(value.isfinite().all() for value in after.values())
+    changed = model.policy.action_net.state_dict()
+    assert any(not th.equal(changed[name], value) for name, value in before.items())
+
+
+@BOTH
 @SQUASHED_OR_NOT
 def test_the_entropy_bonus_is_the_entropy_and_moves_it(
     policy: type[ActorCriticPolicy], squash_output: bool
