@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalizati
 from tqdm import tqdm
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.benchmarks.learning_curves import learning_curves
 from sb3_flowpolicy.policies import contrib, on_policy
 
 CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -211,6 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--seeds", type=int, nargs="+", default=[1, 2, 3])
     add("--episodes", type=int, default=10, help="episodes per test")
     add("--csv", type=Path, default=Path("algorithms.csv"))
+    add("--figure", type=Path, help="also draw the curves of the file there, as PNG")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
     task = TASKS[args.task]
@@ -237,7 +239,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with draft.open("w") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
         draft.replace(args.csv)
-    print(summary([row for row in rows[1:] if row[0] == args.task]))
+    found = [row for row in rows[1:] if row[0] == args.task]
+    print(summary(found))
+    if args.figure is not None:
+        learning_curves(found).savefig(args.figure, dpi=100, metadata={"Software": None})
 
 
 if __name__ == "__main__":

@@ -42,5 +42,8 @@ def test_runs_are_written_down_and_not_repeated(
     trained = []
     train = algorithms.train
     monkeypatch.setattr(algorithms, "train", lambda *run: trained.append(run[1:3]) or train(*run))
-    algorithms.main([*command, "--algorithms", "ppo", "crossq", "--policies", "stock", "flow"])
+    figure = tmp_path / "curves.png"
+    only = ["--policies", "stock", "flow", "--figure", str(figure)]
+    algorithms.main([*command, "--algorithms", "ppo", "crossq", *only])
+    assert figure.read_bytes().startswith(b"\x89PNG")
     assert trained == [("crossq", "stock"), ("crossq", "flow")]
