@@ -62,5 +62,5 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
     for k in range(1, rows):
         axes.axhline(k, color="white", linewidth=3)
     axes.spines[:].set_visible(False)
-    axes.set_title("seeds that solve it at the end, and steps until they first do", fontsize=9)
+    axes.set_title("seeds that solve it at the end,\nand steps until they first do", fontsize=9)
     return figure
