@@ -36,8 +36,8 @@ FLOORS = [
     "seed_batch",
     "hyperparameters",
     "train_seeds",
-    "benchmarks",
     "diagnostics",
+    "benchmarks",
     "zoo",
     "experiments",
 ]
