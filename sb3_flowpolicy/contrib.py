@@ -6,21 +6,32 @@ import inspect
 from typing import Any, ClassVar
 
 from sb3_contrib import TQC, CrossQ
+from sb3_contrib.crossq.policies import CrossQPolicy
+from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flowpolicy.checkpoint import Resumable
 from sb3_flowpolicy.exploration import ColoredExploration
+from sb3_flowpolicy.guarded import Guarded
 from sb3_flowpolicy.policies import contrib as policies
-from sb3_flowpolicy.settings import check_settings
+from sb3_flowpolicy.settings import SETTINGS, check_policy, check_settings, integer
+
+_POLICY_BASES = {TQC: TQCPolicy, CrossQ: CrossQPolicy}
+
+_FURTHER = {"top_quantiles_to_drop_per_net": integer(0), "policy_delay": integer(1)}
 
 
-class _Checked(Resumable, ColoredExploration):
+class _Checked(Guarded, Resumable, ColoredExploration):
     """Says what is wrong with arguments, as SACFlow does."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        theirs = next(base for base in type(self).__mro__ if base in (TQC, CrossQ))
+        theirs, policy_base = next(
+            (base, _POLICY_BASES[base]) for base in type(self).__mro__ if base in _POLICY_BASES
+        )
         names = list(inspect.signature(theirs).parameters)
-        check_settings({**dict(zip(names, args, strict=False)), **kwargs})
+        given = {**dict(zip(names, args, strict=False)), **kwargs}
+        check_settings(given, {**SETTINGS, **_FURTHER})
+        check_policy(given.get("policy"), policy_base, self.policy_aliases)
         try:
             super().__init__(*args, **kwargs)
         except AssertionError as error:  # how SB3 refuses an environment
@@ -70,6 +81,15 @@ class TQCFlow(_Checked, TQC):
         "CnnGaussPolicy": policies.CnnGaussTQCPolicy,
         "MultiInputGaussPolicy": policies.MultiInputGaussTQCPolicy,
     }
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        dropped, quantiles = self.top_quantiles_to_drop_per_net, self.critic.n_quantiles
+        if dropped >= quantiles:
+            raise ValueError(
+                "top_quantiles_to_drop_per_net must be less than n_quantiles of policy_kwargs, "
+                f"got {dropped} of {quantiles}"
+            )
 
 
 class CrossQFlow(_Checked, CrossQ):

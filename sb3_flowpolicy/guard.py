@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch as th
-from stable_baselines3 import SAC
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_flowpolicy.finite import NonFiniteError
 
@@ -36,7 +36,7 @@ class TrainingGuard:
     agents are left as they were at most 2000 updates before, and can be used and saved.
 
     Args:
-        models: The agents, equally many updates old.
+        models: The agents, of SAC or an algorithm that descends from it, equally many updates old.
         seeds: Their seeds, to be named in messages.
 
     Example:
@@ -49,7 +49,9 @@ class TrainingGuard:
         sb3_flowpolicy.finite.NonFiniteError: actor.latent_pi.0.bias must be finite, got inf ...
     """
 
-    def __init__(self, models: Sequence[SAC], seeds: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, models: Sequence[OffPolicyAlgorithm], seeds: Sequence[int] | None = None
+    ) -> None:
         self.models = models
         self.seeds = seeds
         #: Folder of the checkpoints that are being written, to be named in messages.
@@ -207,7 +209,7 @@ class _Snapshot:
         return next(bad, None)
 
 
-def _training_tensors(model: SAC) -> dict[str, th.Tensor]:
+def _training_tensors(model: Any) -> dict[str, th.Tensor]:
     """Everything that an update changes, by name; sharing memory with the model."""
     states: dict[str, th.Tensor] = dict(model.policy.state_dict())
     if model.log_ent_coef is not None:
@@ -221,7 +223,7 @@ def _training_tensors(model: SAC) -> dict[str, th.Tensor]:
         groups = [] if optimizer is None else optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"]]
         for number, parameter in enumerate(parameters):
-            for key, state in optimizer.state.get(parameter, {}).items():  # type: ignore[union-attr]
+            for key, state in optimizer.state.get(parameter, {}).items():
                 states[f"{owner}.optimizer.{number}.{key}"] = state
     return {
         name: state

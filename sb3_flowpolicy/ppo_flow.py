@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 from stable_baselines3 import PPO
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 
+from sb3_flowpolicy.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy as policies
+from sb3_flowpolicy.settings import PPO_SETTINGS, check_policy, check_settings
+
+_COLORED = ("action_noise_color", "action_noise_correlation_time")
+_ARGUMENTS = list(inspect.signature(PPO).parameters)
 
 
 class PPOFlow(PPO):
@@ -23,7 +31,8 @@ class PPOFlow(PPO):
         **kwargs: Keyword arguments of PPO.
 
     Raises:
-        ValueError: If coloured noise is asked for: PPO's ratios take actions to be independent.
+        ValueError: If an argument is out of range, or coloured noise is asked for: PPO's ratios
+            take actions to be independent.
 
     References:
         Proximal Policy Optimization Algorithms (Schulman et al., 2017).
@@ -45,10 +54,44 @@ class PPOFlow(PPO):
     }
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        colored = {name: value for name, value in kwargs.items() if name.startswith("action_noise")}
-        if colored:
-            raise ValueError(
-                "action_noise_color and action_noise_correlation_time must be left to off-policy "
-                f"algorithms: PPO takes successive actions to be independent, got {colored}"
-            )
-        super().__init__(*args, **kwargs)
+        given = {**dict(zip(_ARGUMENTS, args, strict=False)), **kwargs}
+        _refuse_colored_noise(given)
+        check_settings(given, PPO_SETTINGS)
+        check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
+        try:
+            super().__init__(*args, **kwargs)
+        except AssertionError as error:  # how SB3 refuses an environment, or a lone step
+            raise ValueError(str(error)) from error
+
+    def _setup_model(self) -> None:
+        _refuse_colored_noise(vars(self))  # what load() was given
+        super()._setup_model()
+
+    def train(self) -> None:
+        """Do PPO's updates.
+
+        Raises:
+            NonFiniteError: If a reward, or a value, of the rollout is not finite; nothing is
+                learned from it.
+        """
+        for name in ("rewards", "values"):
+            found = getattr(self.rollout_buffer, name)
+            if not all_finite(found):
+                value = float(found[~np.isfinite(found)][0])
+                raise NonFiniteError(
+                    f"{name} must be finite, got {value} in the rollout that ends at step "
+                    f"{self.num_timesteps}; nothing was learned from it",
+                    name,
+                    value,
+                    self.num_timesteps,
+                )
+        super().train()
+
+
+def _refuse_colored_noise(settings: Mapping[str, Any]) -> None:
+    colored = {name: settings[name] for name in _COLORED if name in settings}
+    if colored:
+        raise ValueError(
+            "action_noise_color and action_noise_correlation_time must be left to off-policy "
+            f"algorithms: PPO takes successive actions to be independent, got {colored}"
+        )

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -30,10 +29,9 @@ from sb3_flowpolicy.demonstrations import (
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
 from sb3_flowpolicy.engine.subnormals import flushed_subnormals
 from sb3_flowpolicy.exploration import ColoredExploration
-from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
-from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.guarded import Guarded
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
-from sb3_flowpolicy.settings import check_settings
+from sb3_flowpolicy.settings import check_policy, check_settings
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
@@ -44,7 +42,7 @@ MOST_DRAWN_AT_ONCE = 1000
 _SAC_ARGUMENTS = list(inspect.signature(SAC.__init__).parameters)[3:]
 
 
-class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
+class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
     r"""Soft Actor-Critic with action distributions that correlate and bend.
 
     Everything of SB3's :class:`~stable_baselines3.SAC` holds. In particular a fixed temperature
@@ -122,6 +120,7 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         action_noise_correlation_time: float | None = None,
         **sac_kwargs: Any,
     ) -> None:
+        check_policy(policy, SACPolicy, self.policy_aliases)
         check_settings(
             {
                 **dict(zip(_SAC_ARGUMENTS, sac_args, strict=False)),
@@ -142,7 +141,6 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         self._planned = 0.0
         self._engine: Engine | None = None
         self._engine_refused = False
-        self._guard = TrainingGuard([self])
         self._demonstrations: Any = (
             demonstrations
             if demonstrations is None or is_recipe(demonstrations)
@@ -194,11 +192,6 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             self.add_demonstrations(self._demonstrations)
             self._demonstrations = None
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        self._guard.restart()
-        self._guard.resume_from = None if self._checkpoints is None else self._checkpoints.path
-        normalized = self._vec_normalize_env is not None
-        first = self._last_original_obs if normalized else self._last_obs
-        check_experience({"observations": first}, self.num_timesteps, ENVIRONMENT)
         # Many short calls of learn(), with tests in between say, are a long run as well; a resumed
         # one was counted when it began.
         if self._resumption is None:
@@ -225,21 +218,6 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
             noise = noise.to(engine.networks.actor.data).unsqueeze(0)
         scaled = engine.act(obs.unsqueeze(0), noise).squeeze(0).cpu().numpy()
         return self._finished(scaled, action_noise, n_envs)
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        seen, earned = new_obs, reward
-        if self._vec_normalize_env is not None:  # which would clip infinity
-            seen, earned = self._vec_normalize_env.old_obs, self._vec_normalize_env.old_reward
-        check_step(seen, earned, dones, infos, self.num_timesteps)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Do ``gradient_steps`` updates with minibatches of ``batch_size`` transitions.
@@ -320,18 +298,13 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
                     if parameter.grad is not None:
                         parameter.grad.mul_(factor)
 
-        self._guard.before_updates()
         hook = self.critic.optimizer.register_step_pre_hook(scale_gradient)
         try:
             with flushed_subnormals():
                 super().train(gradient_steps, batch_size)
         finally:
             hook.remove()
-        logged = self.logger.name_to_value
-        logged["train/critic_loss"] *= factor
-        # The critics first: means over several updates do not tell which loss was the first.
-        names = sorted(LOSSES, key="critic_loss".__ne__)
-        self._guard.after_updates(names, [[logged.get(f"train/{name}", 0.0)] for name in names])
+        self.logger.name_to_value["train/critic_loss"] *= factor
 
     def _planned_updates(self, total_timesteps: int) -> float:
         """Count the updates that are still to come, roughly where episodes decide."""
@@ -341,9 +314,6 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         assert isinstance(self.train_freq, TrainFreq)
         return steps / self.env.num_envs * self.gradient_steps / self.train_freq.frequency
 
-    def _on_learning_end(self) -> None:
-        self._guard.look()
-
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """Save as SB3 does; a ``deterministic_mode`` that was set later on is saved as well."""
         if isinstance(self.policy, DistributionPolicy):
@@ -351,14 +321,13 @@ class SACFlow(Resumable, Shareable, ColoredExploration, SAC):
         super().save(path, exclude, include)
 
     def _extra_state(self) -> dict[str, Any]:
-        self._guard.look()  # no checkpoint is spoiled
         # Whoever acts with an engine draws other numbers than whoever acts without.
-        return {"engine": self._engine is not None}
+        return {**super()._extra_state(), "engine": self._engine is not None}
 
     def _set_extra_state(self, state: dict[str, Any]) -> None:
         if state["engine"]:
             self._ready_engine()
 
     def _excluded_save_params(self) -> list[str]:
-        engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned", "_guard"]
+        engine = ["_engine", "_engine_refused", "_worth_compiling", "_planned"]
         return [*super()._excluded_save_params(), "_demonstrations", *engine]

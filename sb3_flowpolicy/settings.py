@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from stable_baselines3.common.type_aliases import TrainFreq
@@ -75,6 +76,11 @@ def either(choice: str, check: Check) -> Check:
     )
 
 
+def or_schedule(check: Check) -> Check:
+    """Accept a function of the progress that remains, too."""
+    return lambda name, value: value if callable(value) else check(name, value)
+
+
 def is_number(value: Any) -> bool:
     """Whether this is a real number that floats can hold: no boolean, no array."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
@@ -87,9 +93,9 @@ def is_number(value: Any) -> bool:
 
 
 def temperature(name: str, value: Any) -> str | float:
-    """Accept a number, ``"auto"``, or ``"auto_0.1"`` with the value to begin with."""
+    """Accept a number of at least 0, ``"auto"``, or ``"auto_0.1"`` with a value to begin with."""
     if not isinstance(value, str):
-        return number()(name, value)
+        return number(0)(name, value)
     word, mark, start = value.partition("_")
     try:
         if word == "auto" and (not mark or 0 < float(start) < math.inf):
@@ -150,11 +156,37 @@ _FURTHER: dict[str, Check] = {
     "policy_kwargs": optional(mapping),
     "replay_buffer_kwargs": optional(mapping),
     "verbose": integer(0),
+    "learning_rate": or_schedule(number(0)),
 }
 
 
-def check_settings(settings: Mapping[str, Any]) -> None:
-    """Check those arguments of SACFlow that are known here.
+#: The same for PPO.
+PPO_SETTINGS: dict[str, Check] = {
+    "n_steps": integer(1),
+    "batch_size": integer(1),
+    "n_epochs": integer(1),
+    "gamma": number(0, 1),
+    "gae_lambda": number(0, 1),
+    "clip_range": or_schedule(number(0, above=True)),
+    "clip_range_vf": optional(or_schedule(number(0, above=True))),
+    "normalize_advantage": flag,
+    "ent_coef": number(0),
+    "vf_coef": number(0),
+    "max_grad_norm": number(0, above=True),
+    "target_kl": optional(number(0, above=True)),
+    "stats_window_size": integer(1),
+    "seed": optional(integer(0, 2**32 - 1)),
+}
+
+
+def check_settings(
+    settings: Mapping[str, Any], table: Mapping[str, Check] = MappingProxyType(SETTINGS)
+) -> None:
+    """Check those arguments of an algorithm that are known here.
+
+    Args:
+        settings: Arguments by name.
+        table: What they may be. Default: that of SACFlow.
 
     Raises:
         ValueError: If one is of another type or out of range; the message names it.
@@ -166,6 +198,27 @@ def check_settings(settings: Mapping[str, Any]) -> None:
         ...
         ValueError: gamma must be a number, got 'high'
     """
-    for name, check in {**SETTINGS, **_FURTHER}.items():
+    for name, check in {**table, **_FURTHER}.items():
         if name in settings:
             check(name, settings[name])
+
+
+def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
+    """Check that an algorithm can train a policy: one of its names, or a class of its kind.
+
+    Raises:
+        ValueError: If the name is unknown, or the class belongs to another algorithm.
+
+    Example:
+        >>> from stable_baselines3.sac.policies import SACPolicy
+        >>> from sb3_flowpolicy import FlowTQCPolicy
+        >>> check_policy(FlowTQCPolicy, SACPolicy, ["FlowPolicy"])
+        Traceback (most recent call last):
+        ...
+        ValueError: policy must be one of ['FlowPolicy'] or a SACPolicy, got FlowTQCPolicy
+    """
+    known = list(names)
+    fits = issubclass(policy, base) if isinstance(policy, type) else policy in known
+    if not fits:
+        name = getattr(policy, "__name__", repr(policy))
+        raise ValueError(f"policy must be one of {known} or a {base.__name__}, got {name}")

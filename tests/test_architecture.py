@@ -19,6 +19,7 @@ FLOORS = [
     "policies",
     "guard",
     "engine",
+    "guarded",
     "settings",
     "bundle",
     "demonstrations",

@@ -10,9 +10,10 @@ import pytest
 import torch as th
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy import CrossQFlow, PPOFlow, TQCFlow
+from sb3_flowpolicy import CrossQFlow, FlowActorCriticPolicy, FlowPolicy, PPOFlow, SACFlow, TQCFlow
 from sb3_flowpolicy.diagnostics import PolicyDiagnosticsCallback
 
 ENV = "TunnelDiagonal-v0"
@@ -89,7 +90,7 @@ def test_names_of_policies(algorithm: Any) -> None:
         if name.startswith(("Cnn", "MultiInput")):
             continue
         assert type(algorithm(name, ENV, device="cpu", **settings).policy) is policy
-    with pytest.raises(ValueError, match="Policy NoPolicy unknown"):
+    with pytest.raises(ValueError, match=r"must be one of .*'LowRankPolicy'.* got 'NoPolicy'"):
         algorithm("NoPolicy", ENV)
 
 
@@ -107,6 +108,11 @@ def test_on_policy_algorithms_have_no_coloured_noise() -> None:
         ({"ent_coef": "aut"}, 'ent_coef must be a number, "auto"'),
         ({"action_noise_color": 2.0}, "action_noise_color must be"),
         ({"policy": "stock", "action_noise_color": 1.0}, "one of sb3_flowpolicy's"),
+        ({"ent_coef": -1.0}, "ent_coef must be at least 0, got -1.0"),
+        ({"learning_rate": -1.0}, "learning_rate must be at least 0, got -1.0"),
+        ({"policy": FlowPolicy}, "policy must be one of .* got FlowPolicy"),
+        ({"policy": FlowActorCriticPolicy}, "policy must be one of .* got FlowActorCriticPolicy"),
+        ({"policy_kwargs": {"n_critics": 0}}, "n_critics must be an integer >= 1, got 0"),
     ],
 )
 def test_bad_arguments(algorithm: Any, arguments: dict[str, Any], message: str) -> None:
@@ -115,6 +121,56 @@ def test_bad_arguments(algorithm: Any, arguments: dict[str, Any], message: str) 
         arguments = {**arguments, "policy": theirs.policy_aliases["MlpPolicy"]}
     with pytest.raises(ValueError, match=message):
         make(algorithm, **arguments)
+
+
+def test_bad_arguments_of_one_algorithm() -> None:
+    for dropped in (25, 99):
+        with pytest.raises(ValueError, match=f"less than n_quantiles .* got {dropped} of 25"):
+            make(TQCFlow, top_quantiles_to_drop_per_net=dropped)
+    with pytest.raises(ValueError, match="top_quantiles_to_drop_per_net must be an integer of at"):
+        make(TQCFlow, top_quantiles_to_drop_per_net=1.5)
+    with pytest.raises(ValueError, match="n_quantiles must be an integer >= 1, got 0"):
+        make(TQCFlow, policy_kwargs={"n_quantiles": 0})
+    with pytest.raises(ValueError, match="policy_delay must be an integer of at least 1, got 0"):
+        make(CrossQFlow, policy_delay=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"n_steps": 2.5}, "n_steps must be an integer of at least 1, got 2.5"),
+        ({"n_steps": 1}, "n_steps"),
+        ({"n_epochs": 0}, "n_epochs must be an integer of at least 1, got 0"),
+        ({"gamma": 2}, "gamma must be at most 1, got 2"),
+        ({"clip_range": 0.0}, "clip_range must be above 0, got 0.0"),
+        ({"clip_range_vf": "a"}, "clip_range_vf must be a number, got 'a'"),
+        ({"target_kl": -1.0}, "target_kl must be above 0, got -1.0"),
+        ({"ent_coef": "auto"}, "ent_coef must be a number, got 'auto'"),
+        ({"learning_rate": "a"}, "learning_rate must be a number, got 'a'"),
+        ({"seed": "a"}, "seed must be an integer"),
+        ({"policy_kwargs": 5}, "policy_kwargs must be a dict"),
+        ({"policy": TQC.policy_aliases["MlpPolicy"]}, "policy must be one of .* got TQCPolicy"),
+    ],
+)
+def test_bad_arguments_of_ppo(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PPOFlow(**{"policy": "FlowPolicy", "env": ENV, "n_steps": 32, **arguments})
+    PPOFlow("FlowPolicy", ENV, n_steps=32, clip_range=lambda left: 0.2 * left, target_kl=None)
+
+
+def test_loading_ppo_takes_no_coloured_noise(tmp_path: Path) -> None:
+    PPOFlow("FlowPolicy", ENV, n_steps=32).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"off-policy algorithms: .* got {'action_noise_color': 9"):
+        PPOFlow.load(tmp_path / "model", action_noise_color=9.0)
+
+
+@pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow, CrossQFlow, PPOFlow])
+def test_policies_of_other_observations(algorithm: Any) -> None:
+    with pytest.raises(ValueError, match=r"observation_space must be no Dict .* MultiInput"):
+        algorithm("FlowPolicy", SimpleMultiObsEnv(discrete_actions=False))
+    if algorithm is not CrossQFlow:
+        with pytest.raises(ValueError, match="observation_space must be a Dict for Combined"):
+            algorithm("MultiInputFlowPolicy", ENV)
 
 
 @OFF_POLICY

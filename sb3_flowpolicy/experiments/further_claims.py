@@ -98,7 +98,7 @@ FURTHER_CLAIMS = (
         name="move-x",
         claim="E10",
         source="section 3.3.3, figures 3.18 and 3.19",
-        title="The same with movement along y penalised: who moves farther along x?",
+        title="Hold the square and move along x only: who moves farther?",
         thesis="NF's standard deviation of x is about three times Gauss's and its greatest "
         "distance about twice, LR lies between.",
         settings=(Setting("move-x", "SquareMoveX-v0"),),

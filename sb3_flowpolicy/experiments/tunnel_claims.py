@@ -135,7 +135,7 @@ TUNNEL_CLAIMS = (
         name="sparse-fixed-entropy",
         claim="E6",
         source="section 3.2.4, figure 3.11",
-        title="The same with learned temperature",
+        title="Straight tunnel with sparse reward, learned temperature",
         thesis="The same picture, all agents a little worse than with the fixed temperature. "
         "Gauss finds the diagonal goal now and then.",
         settings=tuple(Setting(s.name, s.env_id, overrides=LEARNED) for s in _SPARSE),

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
+from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     CombinedExtractor,
+    FlattenExtractor,
     NatureCNN,
 )
 
@@ -37,6 +39,31 @@ def for_dicts(*policies: type[Policy]) -> tuple[type[Policy], ...]:
     """
     extractor = CombinedExtractor
     return tuple(_with(policy, "MultiInput", "dictionary", extractor) for policy in policies)
+
+
+def check_observation_space(space: spaces.Space, extractor: type[BaseFeaturesExtractor]) -> None:
+    """Check that SB3's extractors are given what they can read; others know for themselves.
+
+    Raises:
+        ValueError: If the space is a dictionary and the extractor is for arrays, or the reverse.
+
+    Example:
+        >>> check_observation_space(spaces.Dict({}), NatureCNN)
+        Traceback (most recent call last):
+        ...
+        ValueError: observation_space must be no Dict for NatureCNN (Dicts take a MultiInput... ...
+    """
+    is_dict = isinstance(space, spaces.Dict)
+    if is_dict and extractor in (FlattenExtractor, NatureCNN):
+        wanted = "no Dict for"
+    elif not is_dict and extractor is CombinedExtractor:
+        wanted = "a Dict for"
+    else:
+        return
+    raise ValueError(
+        f"observation_space must be {wanted} {extractor.__name__} (Dicts take a MultiInput... "
+        f"policy, all else one without), got {space}"
+    )
 
 
 def _with(

@@ -21,6 +21,7 @@ from sb3_flowpolicy.policies.deterministic import (
     best_actions,
     check_settings,
 )
+from sb3_flowpolicy.policies.extractors import check_observation_space
 
 
 class DistributionPolicy(BasePolicy):
@@ -89,7 +90,13 @@ class DistributionPolicy(BasePolicy):
             raise ValueError(
                 f"distribution_kwargs must have strings as keys, got {distribution_kwargs!r}"
             )
-        _check_net_arch(policy_kwargs.get("net_arch"))
+        check_net_arch(policy_kwargs.get("net_arch"), "qf", both=True)
+        for name in {"n_critics", "n_quantiles"} & set(policy_kwargs):
+            positive_int(name, policy_kwargs[name])
+        extractor = policy_kwargs.setdefault(
+            "features_extractor_class", self.default_features_extractor_class
+        )
+        check_observation_space(observation_space, extractor)
         policies = [base for base in type(self).__mro__ if issubclass(base, BasePolicy)]
         theirs = next(base for base in policies if not issubclass(base, DistributionPolicy))
         unknown = sorted(set(policy_kwargs) - set(inspect.signature(theirs).parameters))
@@ -106,7 +113,6 @@ class DistributionPolicy(BasePolicy):
         self._uses_sde = bool(policy_kwargs.get("use_sde"))
         self.deterministic_samples = deterministic_samples
         self.deterministic_mode = deterministic_mode
-        policy_kwargs.setdefault("features_extractor_class", self.default_features_extractor_class)
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
@@ -171,16 +177,25 @@ class DistributionPolicy(BasePolicy):
         return data
 
 
-def _check_net_arch(net_arch: Any) -> None:
-    """Raise ``ValueError`` unless these are units per layer; torch's messages would not say."""
+def check_net_arch(net_arch: Any, critic: str, both: bool) -> None:
+    """Check that these are units per layer; torch's messages would not say.
+
+    Args:
+        net_arch: Units of each layer, of actor and critic alike or of each.
+        critic: What the algorithm calls its critic.
+        both: Whether a mapping must tell of both, or may leave one without layers.
+
+    Raises:
+        ValueError: If they are not.
+    """
     if net_arch is None:
         return
+    archs = [net_arch]
     if isinstance(net_arch, Mapping):
-        if set(net_arch) != {"pi", "qf"}:
-            raise ValueError(f"net_arch must have the keys 'pi' and 'qf', got {list(net_arch)}")
+        keys, known = set(net_arch), {"pi", critic}
+        if keys != known if both else not keys <= known:
+            raise ValueError(f"net_arch must have the keys 'pi' and {critic!r}, got {[*net_arch]}")
         archs = list(net_arch.values())
-    else:
-        archs = [net_arch]
     for arch in archs:
         if not isinstance(arch, list | tuple):
             raise ValueError(f"net_arch must be a list of units per layer, got {arch!r}")

@@ -17,8 +17,8 @@ from torch import nn
 
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
 from sb3_flowpolicy.finite import all_finite
-from sb3_flowpolicy.policies.extractors import for_dicts, for_images
-from sb3_flowpolicy.policies.off_policy import check_finite_actions
+from sb3_flowpolicy.policies.extractors import check_observation_space, for_dicts, for_images
+from sb3_flowpolicy.policies.off_policy import check_finite_actions, check_net_arch
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # Of SB3's normal distributions, which are not built.
@@ -79,13 +79,17 @@ class DensityActorCritic(ActorCriticPolicy):
         if squash_output and not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
                 "action_space must have finite bounds for actions to be squashed into, got "
-                f"{action_space}: pass squash_output=False"
+                f"{action_space}"
             )
         if use_sde:
-            raise ValueError("use_sde must be False: gSDE is a density of its own, got True")
+            raise ValueError("use_sde must be False: gSDE goes with SB3's own policies, got True")
         if not isinstance(distribution_kwargs, Mapping | None):
             raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
-        _check_net_arch(policy_kwargs.get("net_arch"))
+        check_net_arch(policy_kwargs.get("net_arch"), "vf", both=False)
+        extractor = policy_kwargs.setdefault(
+            "features_extractor_class", self.default_features_extractor_class
+        )
+        check_observation_space(observation_space, extractor)
         bases = [base for base in type(self).__mro__ if issubclass(base, ActorCriticPolicy)]
         known = {name for base in bases for name in inspect.signature(base).parameters} - _NOT_OURS
         unknown = sorted(set(policy_kwargs) - known)
@@ -98,7 +102,6 @@ class DensityActorCritic(ActorCriticPolicy):
         self.distribution = self.default_distribution if distribution is None else distribution
         self.distribution_kwargs = dict(distribution_kwargs or {})
         self._squashes = squash_output
-        policy_kwargs.setdefault("features_extractor_class", self.default_features_extractor_class)
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
         # SB3's constructor allows it to gSDE only, though all of SB3 that reads it is ready for us.
         self._squash_output = squash_output
@@ -171,15 +174,6 @@ class DensityActorCritic(ActorCriticPolicy):
 def _bounded(gradient: th.Tensor) -> th.Tensor:
     """Bound a gradient; NaN is 0 x infinity, of a ratio that PPO has clipped: no gradient."""
     return gradient.nan_to_num(nan=0.0).clamp(-_LARGEST_GRADIENT, _LARGEST_GRADIENT)
-
-
-def _check_net_arch(net_arch: Any) -> None:
-    """Raise ``ValueError`` unless these are units per layer, for actor and critic or each."""
-    if isinstance(net_arch, Mapping) and not set(net_arch) <= {"pi", "vf"}:
-        raise ValueError(f"net_arch must have the keys 'pi' and 'vf', got {list(net_arch)}")
-    parts = net_arch.values() if isinstance(net_arch, Mapping) else [net_arch]
-    if net_arch is not None and not all(isinstance(part, list | tuple) for part in parts):
-        raise ValueError(f"net_arch must be a list of units per layer, got {net_arch!r}")
 
 
 class FlowActorCriticPolicy(DensityActorCritic):
