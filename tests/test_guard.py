@@ -94,7 +94,8 @@ def test_other_algorithms_go_back_as_well(algorithm: Any) -> None:
         model.train(2, 16)
     assert caught.value.restored == 0  # what it last looked at and kept
     after = model.policy.state_dict()
-    assert not [name for name, value in before.items() if not th.equal(value, after[name])]
+    changed = {name for name, value in before.items() if not th.equal(value, after[name])}
+    assert not {name for name in changed if not name.endswith(".steps")}  # CrossQ's warm-up
 
 
 def test_ppo_learns_nothing_from_nan() -> None:
