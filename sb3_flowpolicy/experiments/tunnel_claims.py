@@ -152,8 +152,8 @@ TUNNEL_CLAIMS = (
         "agent fails most training episodes, so their training success lies closer together than "
         "the rule asks. Along the axis, the image of the flow's base mean is no good action at "
         'that entropy: with `deterministic_mode="log_prob"` ten of ten other seeds solve it '
-        "(docs/guide/deterministic.md). The target is the thesis's and was not changed. The line on "
-        "equal returns along the axis was added after the runs, as in sparse-fixed-alpha.",
+        "(docs/guide/deterministic.md). The target is the thesis's and was not changed. The line "
+        "on equal returns along the axis was added after the runs, as in sparse-fixed-alpha.",
     ),
     Experiment(
         name="diagonal-dimensions",
