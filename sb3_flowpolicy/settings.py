@@ -16,13 +16,17 @@ from sb3_flowpolicy.noise_process import MAX_COLOR
 Check = Callable[[str, Any], Any]
 
 
-def integer(least: int, most: int = 2**53) -> Check:
+_ANY = 2**53  # what a JSON number holds without rounding
+
+
+def integer(least: int, most: int = _ANY) -> Check:
     """Accept integers from ``least`` to ``most``, not booleans."""
 
     def check(name: str, value: Any) -> int:
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
         if not whole or not least <= value <= most:
-            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+            bounds = f"of at least {least}" if most == _ANY else f"from {least} to {most}"
+            raise ValueError(f"{name} must be an integer {bounds}, got {value!r}")
         return int(value)
 
     return check

@@ -31,6 +31,10 @@ def rows_of_seeds(
             missing or was changed.
     """
     logs: dict[int, list[Row]] = {seed: [] for seed in item["seeds"]}
+    if done is not None and done["seeds"] != [*logs]:
+        raise ValueError(f"{files.done} must tell of seeds {[*logs]}, got {done['seeds']}")
+    if done is not None and done["steps"] < item["steps"]:
+        raise ValueError(f"{files.done} must tell of {item['steps']} steps, got {done['steps']}")
     for row in files.read_rows():
         if row["seed"] not in logs:
             raise ValueError(f"{files.table} must hold seeds {[*logs]}, got {row['seed']:g}")

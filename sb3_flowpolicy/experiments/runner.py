@@ -16,10 +16,11 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from sb3_flowpolicy.experiments.costs import item_seconds
+from sb3_flowpolicy.experiments.integrity import rows_of_seeds
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.settings_file import claim_folder
 from sb3_flowpolicy.experiments.store import ItemFiles
-from sb3_flowpolicy.experiments.work import Plan, WorkItem
+from sb3_flowpolicy.experiments.work import Plan, WorkItem, describe
 
 # Read by OpenMP and numba when a process starts: one thread each, as many processes as cores.
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -52,8 +53,20 @@ def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
 
 
 def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
-    """Return the items that are still to be done."""
-    return [item for item in plan.items if not ItemFiles(folder, item.key).finished]
+    """Return the items that are still to be done.
+
+    Raises:
+        ValueError: If files of an item that is finished are damaged or missing.
+    """
+    found = []
+    for item in plan.items:
+        files = ItemFiles(folder, item.key)
+        done = files.read_done()
+        if done is None:
+            found.append(item)
+        else:
+            rows_of_seeds(files, describe(item), done)
+    return found
 
 
 def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:

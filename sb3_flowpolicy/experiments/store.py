@@ -38,7 +38,7 @@ BASIC_COLUMNS = (
 Row = dict[str, float | None]
 
 DONE_FIELDS = {
-    **{"steps": int, "seeds": list, "table": int, "details": int},
+    **{"key": str, "steps": int, "seeds": list, "table": int, "details": int, "sha256": str},
     **{"cpu_seconds": (int, float), "steps_per_second": (int, float)},
     "machine": {
         **{"commit": (str, type(None)), "cpu_count": (int, type(None))},
@@ -103,7 +103,7 @@ class ItemFiles:
         """Say how the files differ from what they were.
 
         Args:
-            noted: What :meth:`fingerprint` returned; results of old have no ``sha256``.
+            noted: What :meth:`fingerprint` returned; the ``sha256`` may be missing.
 
         Returns:
             A sentence; None if they are the same.
@@ -140,7 +140,7 @@ class ItemFiles:
 
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Declare the item complete and drop its checkpoints."""
-        write_json(self.done, facts)
+        write_json(self.done, {**facts, "key": self.key})
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
     def read_rows(self) -> list[Row]:
@@ -198,9 +198,14 @@ class ItemFiles:
         """Return the facts of a finished item, None of an unfinished one.
 
         Raises:
-            ValueError: If the file is corrupt.
+            ValueError: If the file is corrupt, or another item's.
         """
-        return read_json(self.done, DONE_FIELDS) if self.finished else None
+        if not self.finished:
+            return None
+        done = read_json(self.done, DONE_FIELDS)
+        if done["key"] != self.key:
+            raise ValueError(f"{self.done} must be of {self.key}, got {done['key']!r}: {_ADVICE}")
+        return done
 
 
 _ADVICE = "restore the file, or delete all files of this item and run it again"

@@ -136,6 +136,8 @@ class _Training:
         found = sorted(self.files.checkpoints.glob("step_*"))
         if not found:
             return None
+        if not (found[-1] / "state.json").is_file():
+            raise ValueError(f"{found[-1]} must hold state.json: {self._advice}")
         state = read_json(found[-1] / "state.json", _STATE_FIELDS)
         self.files.cut_to(state["files"])
         self.done_steps = state["step"]
@@ -149,8 +151,12 @@ class _Training:
         except Exception as error:  # whatever torch, pickle and zip say about half a file
             raise ValueError(
                 f"{found[-1]} must hold a whole checkpoint, got {type(error).__name__} ({error}): "
-                f"delete {self.files.checkpoints} and {self.files.table} to repeat this item"
+                f"{self._advice}"
             ) from error
+
+    @property
+    def _advice(self) -> str:
+        return f"delete {self.files.checkpoints} and {self.files.table} to repeat this item"
 
     def _load(self, checkpoint: Path) -> SeedBatch | SeparateSeeds:
         if self._one_by_one:

@@ -117,6 +117,8 @@ def make_plan(
     for name, (value, bound) in {**least, "first_seed": (first_seed, 0)}.items():
         if value < bound:
             raise ValueError(f"{name} must be at least {bound}, got {value}")
+    if first_seed + seeds > 2**32:
+        raise ValueError(f"first_seed must leave seeds below {2**32}, got {first_seed}")
     chosen = tuple(range(first_seed, first_seed + seeds))
     groups = [chosen[i : i + seeds_per_item] for i in range(0, seeds, seeds_per_item)]
     items = [

@@ -59,6 +59,7 @@ def test_a_run_leaves_results_and_is_not_repeated(
         (["tiny", "--seeds", "0"], "seeds must be at least 1, got 0"),
         (["tiny", "--steps", "-5"], "steps must be at least 1, got -5"),
         (["tiny", "--seeds-per-item", "0"], "seeds_per_item must be at least 1, got 0"),
+        (["tiny", "--first-seed", "4294967295"], "first_seed must leave seeds below 4294967296"),
         (["tiny", "--workers", "0"], "--workers must be at least 1, got 0"),
         (["tiny", "--address", "auto"], "--address needs --backend ray, got 'local'"),
     ],

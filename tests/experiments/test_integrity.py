@@ -84,6 +84,35 @@ def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"key": "narrow-gauss"}, "must be of narrow-flow, got 'narrow-gauss'"),
+        ({"seeds": [9, 1]}, r"must tell of seeds \[1, 2\], got \[9, 1\]"),
+        ({"steps": 5000}, "must tell of 60000 steps, got 5000"),
+    ],
+)
+def test_facts_of_something_else_are_noticed(
+    facts: dict[str, Any], message: str, make_up: MakeUp, tmp_path: Path
+) -> None:
+    make_up(NAME, seeds=2)
+    done = tmp_path / NAME / "narrow-flow.done.json"
+    done.write_text(json.dumps({**json.loads(done.read_text()), **facts}))
+    with pytest.raises(ValueError, match=rf"narrow-flow\.done\.json {message}"):
+        Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
+
+
+def test_a_run_does_not_build_on_damage(
+    make_up: MakeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_up(NAME, seeds=2)
+    command = ["run", NAME, "--seeds", "2", "--out", str(tmp_path), "--no-progress"]
+    assert main(command) == 0
+    (tmp_path / NAME / "narrow-flow.csv").unlink()
+    assert main(command) == 1
+    assert "narrow-flow.csv must hold seed 1 up to step 60000, got none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("file", "drop", "message"),
     [
         ("settings.json", "steps", r"settings\.json must hold 'steps' \(int\)"),

@@ -158,6 +158,9 @@ def test_a_state_without_its_fields_is_named(item: WorkItem, tmp_path: Path) -> 
     next(files.checkpoints.glob("step_*/state.json")).write_text("{}")
     with pytest.raises(ValueError, match=r"state\.json must hold 'step' \(int\), got {}"):
         run_item(item, tmp_path, quiet)
+    next(files.checkpoints.glob("step_*/state.json")).unlink()
+    with pytest.raises(ValueError, match=r"step_0+\d+ must hold state\.json: delete .* to repeat"):
+        run_item(item, tmp_path, quiet)
 
 
 def test_a_crash_while_saving_leaves_the_last_checkpoint(
