@@ -13,7 +13,13 @@ from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missi
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
 from sb3_flowpolicy.experiments.shared_items import adopt
-from sb3_flowpolicy.experiments.work import FIRST_SEED, SEEDS_PER_ITEM, make_plan
+from sb3_flowpolicy.experiments.work import (
+    FIRST_SEED,
+    QUICK_SEEDS,
+    QUICK_STEPS,
+    SEEDS_PER_ITEM,
+    make_plan,
+)
 
 OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")}
 
@@ -109,6 +115,8 @@ def _report(args: argparse.Namespace) -> None:
     from sb3_flowpolicy.experiments.markdown import write_docs
     from sb3_flowpolicy.experiments.report import write_report
 
+    if args.html is not None and args.html.is_dir():
+        raise ValueError(f"--html must be a file, got the folder {args.html}")
     page = write_report(args.results, args.html or args.results / "report.html")
     print(f"Report: {page}")
     if args.docs is not None:
@@ -145,12 +153,21 @@ def _parser() -> argparse.ArgumentParser:
         add = command.add_argument
         if name == "run":
             add("name", metavar="NAME", help="experiment; `list` shows them")
-            add("--seeds", type=int, help="number of seeds (default: the experiment's)")
+            add(
+                "--seeds",
+                type=int,
+                help=f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})",
+            )
             add("--first-seed", type=int, default=FIRST_SEED, help="1 for results, 100 for tuning")
-            add("--steps", type=int, help="steps per seed (default: the experiment's)")
+            add(
+                "--steps",
+                type=int,
+                help=f"steps per seed (default: the experiment's; quick: {QUICK_STEPS})",
+            )
             add("--backend", choices=("local", "ray"), default="local", help="where to run")
             add("--address", help="Ray cluster to join, 'auto' for the one this machine is in")
-            add("--out", type=Path, help=f"folder for results (default: {OUT['full']})")
+            outs = " or ".join(map(str, OUT.values()))
+            add("--out", type=Path, help=f"folder for results (default: {outs}, by profile)")
             add(
                 "--seeds-per-item",
                 type=int,

@@ -27,7 +27,7 @@ IN_A_ROW = 3
 OSCILLATIONS = {"train_return": 0.25, "entropy": 1.0, "log_ent_coef": 0.1}
 """What counts as a swing: a quarter of the best test return, a nat, a tenth of the temperature."""
 SWINGS_OF_AN_OSCILLATION = 3
-"""Up, down and up again, or the reverse: a single overshoot is no oscillation."""
+"""Up, down, up and down again, or the reverse: a single overshoot is no oscillation."""
 
 
 class Evidence:

@@ -92,7 +92,7 @@ class Experiment:
     Attributes:
         name: Name in commands and folders.
         claim: Number of the claim; E1 to E11 follow the thesis, D2 and up are ours.
-        source: Section and figures of the thesis.
+        source: Section and figures of the thesis; ``"ours"`` where there is nothing to reproduce.
         title: One line that says what is compared.
         thesis: What the thesis found, in our words.
         settings: Environments with hyperparameters.

@@ -59,7 +59,7 @@ def _overview(results: Path) -> str:
 
 
 def _verdict(section: Section) -> str:
-    return section.verdict + (f" ({section.reservation})" if section.reservation else "")
+    return section.verdict_in_words + (f" ({section.reservation})" if section.reservation else "")
 
 
 def _markdown(section: Section, images: dict[str, str]) -> str:

@@ -13,6 +13,7 @@ from rliable import library, metrics
 from scipy.stats import bootstrap, trim_mean
 
 RESAMPLES = 2000
+RESAMPLES_OF_PAIRS = 500
 # Intervals are part of the published tables: the same data give the same digits.
 _BOOTSTRAP_SEED = 20200901
 
@@ -140,7 +141,7 @@ def _improvement(better: tuple[float, ...], worse: tuple[float, ...]) -> Estimat
     return _estimate(
         [np.array(better)[:, None], np.array(worse)[:, None]],
         lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-        RESAMPLES // 4,
+        RESAMPLES_OF_PAIRS,
     )
 
 

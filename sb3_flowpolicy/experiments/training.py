@@ -138,7 +138,10 @@ class _Training:
             return None
         if not (found[-1] / "state.json").is_file():
             raise ValueError(f"{found[-1]} must hold state.json: {self._advice}")
-        state = read_json(found[-1] / "state.json", _STATE_FIELDS)
+        try:
+            state = read_json(found[-1] / "state.json", _STATE_FIELDS)
+        except ValueError as error:
+            raise ValueError(f"{error}: {self._advice}") from error
         self.files.cut_to(state["files"])
         self.done_steps = state["step"]
         self.seconds_before, self.cpu_before = state["seconds"], state["cpu_seconds"]

@@ -106,7 +106,7 @@ TUNNEL_CLAIMS = (
         "With a goal of 10 all three swing, so it is 10 here. Progress scaled down to a tenth "
         "instead slowed the agents down (first success of Gauss after 26 000 to 35 000 steps). "
         "Seen afterwards: some Gauss seeds never reach the goal while training. Such a seed has "
-        "nothing to swing between; it counts as steady all the same.",
+        "nothing to swing between, so being steady was made to demand that most seeds learn.",
     ),
     Experiment(
         name="sparse-fixed-alpha",

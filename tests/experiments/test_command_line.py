@@ -113,6 +113,8 @@ def test_a_report_of_nothing_says_how_to_make_something(
 ) -> None:
     assert main(["report", "--results", str(tmp_path)]) == 1
     assert "experiments run NAME makes some" in capsys.readouterr().err
+    assert main(["report", "--results", str(tmp_path), "--html", str(tmp_path)]) == 1
+    assert "--html must be a file, got the folder" in capsys.readouterr().err
 
 
 def _command(out: Path) -> list[str]:

@@ -144,6 +144,16 @@ def test_a_try_out_is_no_result(make_up: MakeUp, tmp_path: Path) -> None:
     assert Section(evidence("circle-narrow", tmp_path)).reservation is None
 
 
+def test_our_experiments_reproduce_nothing(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("diagonal-dimensions", {"4-dimensions-flow": 0.0})
+    section = Section(evidence("diagonal-dimensions", tmp_path))
+    assert section.verdict == PARTLY
+    assert section.verdict_in_words == "some lines hold"
+    make_up("circle-narrow")
+    theirs = Section(evidence("circle-narrow", tmp_path))
+    assert theirs.verdict_in_words == theirs.verdict
+
+
 def test_a_corrupt_line_stops_the_report(
     make_up: MakeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
