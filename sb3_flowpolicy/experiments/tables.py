@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.statistics import interquartile_mean
+from sb3_flowpolicy.experiments.statistics import Estimate, interquartile_mean
 from sb3_flowpolicy.experiments.work import FIRST_SEED
 
 WORDS = {
@@ -17,8 +17,12 @@ WORDS = {
     "entropy": "entropy",
     "ent_coef": "temperature",
     "same_axis_correlation": "correlation of same-axis actions",
+    "x_std": "standard deviation of x",
+    "x_max": "greatest distance along x",
 }
 """How metrics are called in sentences."""
+
+_DECIMALS = {"ent_coef": 4, "x_std": 3, "x_max": 3}
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,11 @@ class Table:
         """Return the table as Markdown."""
         lines = [self.head, ["---"] * len(self.head), *self.rows]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def in_digits(metric: str, estimate: Estimate) -> str:
+    """Return an estimate with as many digits as its metric is worth."""
+    return f"{estimate:.{_DECIMALS.get(metric, 2)}f}"
 
 
 _METRICS = ("train_return", "train_success", "test_return", "test_success", "entropy", "ent_coef")
@@ -62,7 +71,7 @@ def results_table(evidence: Evidence) -> Table:
         for name in metrics:
             if name in columns:
                 final = interquartile_mean(evidence.final(setting.name, agent.name, name))
-                row.append(f"{final:.4f}" if name == "ent_coef" else f"{final:.2f}")
+                row.append(in_digits(name, final))
             else:
                 row.append("-")
         rows.append(row)
