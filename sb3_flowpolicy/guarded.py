@@ -70,7 +70,8 @@ class Guarded(OffPolicyAlgorithm):
         """Do ``gradient_steps`` updates of the algorithm's own, and look at their losses.
 
         Raises:
-            NonFiniteError: If one is not finite; weights are then as they were before.
+            NonFiniteError: If one is not finite; weights are as at the last look, 2000 updates ago
+                at most.
         """
         self._guard.before_updates()
         super().train(gradient_steps, batch_size)
