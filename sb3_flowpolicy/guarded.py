@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_flowpolicy.engine import LOSSES
-from sb3_flowpolicy.finite import ENVIRONMENT, check_experience, check_step
+from sb3_flowpolicy.finite import ENVIRONMENT, NonFiniteError, check_experience, check_step
 from sb3_flowpolicy.guard import TrainingGuard
 
 # The critics first: means over several updates do not tell which loss was the first.
@@ -76,7 +76,13 @@ class Guarded(OffPolicyAlgorithm):
         self._guard.before_updates()
         super().train(gradient_steps, batch_size)
         logged = self.logger.name_to_value
-        self._guard.after_updates(_NAMES, [[logged.get(f"train/{name}", 0.0)] for name in _NAMES])
+        losses = {f"train/{name}": logged.get(f"train/{name}", 0.0) for name in _NAMES}
+        try:
+            self._guard.after_updates(_NAMES, [[loss] for loss in losses.values()])
+        except NonFiniteError:
+            for name in losses:  # or they would be taken for those of updates to come
+                logged.pop(name, None)
+            raise
 
     def _on_learning_end(self) -> None:
         self._guard.look()

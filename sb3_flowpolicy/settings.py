@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_flowpolicy.noise_process import MAX_COLOR
@@ -51,10 +52,10 @@ def number(least: float = -math.inf, most: float = math.inf, above: bool = False
 
 
 def flag(name: str, value: Any) -> bool:
-    """Accept True and False."""
-    if not isinstance(value, bool):
+    """Accept True and False, numpy's as well."""
+    if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {value!r}")
-    return value
+    return bool(value)
 
 
 def one_of(*words: str) -> Check:
@@ -83,6 +84,11 @@ def either(choice: str, check: Check) -> Check:
 def or_schedule(check: Check) -> Check:
     """Accept a function of the progress that remains, too."""
     return lambda name, value: value if callable(value) else check(name, value)
+
+
+def or_infinity(check: Check) -> Check:
+    """Accept infinity, too."""
+    return lambda name, value: value if value == math.inf else check(name, value)
 
 
 def is_number(value: Any) -> bool:
@@ -159,7 +165,7 @@ SETTINGS: dict[str, Check] = {
 _FURTHER: dict[str, Check] = {
     "policy_kwargs": optional(mapping),
     "replay_buffer_kwargs": optional(mapping),
-    "verbose": integer(0),
+    "verbose": lambda name, value: value if isinstance(value, bool) else integer(0)(name, value),
     "learning_rate": or_schedule(number(0)),
 }
 
@@ -176,7 +182,7 @@ PPO_SETTINGS: dict[str, Check] = {
     "normalize_advantage": flag,
     "ent_coef": number(0),
     "vf_coef": number(0),
-    "max_grad_norm": number(0, above=True),
+    "max_grad_norm": or_infinity(number(0, above=True)),
     "target_kl": optional(number(0, above=True)),
     "stats_window_size": integer(1),
     "seed": optional(integer(0, 2**32 - 1)),

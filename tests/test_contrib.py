@@ -155,7 +155,21 @@ def test_bad_arguments_of_one_algorithm() -> None:
 def test_bad_arguments_of_ppo(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PPOFlow(**{"policy": "FlowPolicy", "env": ENV, "n_steps": 32, **arguments})
+
+
+def test_good_arguments_of_ppo() -> None:
+    """What SB3 takes, ours takes."""
     PPOFlow("FlowPolicy", ENV, n_steps=32, clip_range=lambda left: 0.2 * left, target_kl=None)
+    PPOFlow("FlowPolicy", ENV, n_steps=32, max_grad_norm=float("inf"), verbose=False)
+    PPOFlow(
+        "FlowPolicy",
+        ENV,
+        n_steps=np.int64(32),
+        normalize_advantage=np.bool_(True),
+        policy_kwargs={"net_arch": {"pi": [np.int64(4)], "vf": []}},
+    )
+    with pytest.warns(UserWarning, match="directly a dictionary"):
+        PPOFlow("FlowPolicy", ENV, n_steps=32, policy_kwargs={"net_arch": [{"pi": [4], "vf": [4]}]})
 
 
 def test_loading_ppo_takes_no_coloured_noise(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ r"""What every action density has to be: a pure function of parameters, context 
 from __future__ import annotations
 
 import math
+import numbers
 from abc import ABC, abstractmethod
 
 import torch as th
@@ -128,9 +129,10 @@ def soft_bound(value: th.Tensor, bound: float | th.Tensor) -> th.Tensor:
 
 def positive_int(name: str, value: int) -> int:
     """Return ``value`` if it is an integer of at least 1, otherwise raise ``ValueError``."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not whole or value < 1:
         raise ValueError(f"{name} must be an integer >= 1, got {value!r}")
-    return value
+    return int(value)
 
 
 def _check_last_dim(name: str, tensor: th.Tensor, expected: int) -> None:

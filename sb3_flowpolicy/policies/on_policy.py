@@ -85,7 +85,10 @@ class DensityActorCritic(ActorCriticPolicy):
             raise ValueError("use_sde must be False: gSDE goes with SB3's own policies, got True")
         if not isinstance(distribution_kwargs, Mapping | None):
             raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
-        check_net_arch(policy_kwargs.get("net_arch"), "vf", both=False)
+        net_arch = policy_kwargs.get("net_arch")
+        if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], Mapping):
+            net_arch = net_arch[0]  # as before SB3 1.8, which still takes it with a warning
+        check_net_arch(net_arch, "vf", both=False)
         extractor = policy_kwargs.setdefault(
             "features_extractor_class", self.default_features_extractor_class
         )
