@@ -73,6 +73,8 @@ class Guarded(OffPolicyAlgorithm):
             NonFiniteError: If one is not finite; weights are as at the last look, 2000 updates ago
                 at most.
         """
+        if gradient_steps == 0:  # of no losses SB3 logs the mean, NaN
+            return
         self._guard.before_updates()
         super().train(gradient_steps, batch_size)
         logged = self.logger.name_to_value

@@ -87,6 +87,7 @@ def test_other_algorithms_go_back_as_well(algorithm: Any) -> None:
     model = algorithm("FlowPolicy", Faulty("nothing", 0.0), **SEEDED)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     model.learn(30)
+    model.train(0)
     model.replay_buffer.rewards[:] = np.inf
     with pytest.raises(
         NonFiniteError, match=r"critic_loss must be finite, got .*rewards"

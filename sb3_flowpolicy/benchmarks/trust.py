@@ -17,7 +17,7 @@ import numpy as np
 import torch as th
 
 import flowpolicy_envs
-from sb3_flowpolicy import sac_flow, seed_batch
+from sb3_flowpolicy import guarded, seed_batch
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 from sb3_flowpolicy.benchmarks.updates import Unmoved
 from sb3_flowpolicy.benchmarks.zoo_blocks import zoo_block
@@ -92,7 +92,7 @@ class _Turns:
     def unwatched(self) -> float:
         self.models._guard = _Blind()
         with (
-            mock.patch("sb3_flowpolicy.sac_flow.check_step", _accept),
+            mock.patch("sb3_flowpolicy.guarded.check_step", _accept),
             mock.patch("sb3_flowpolicy.seed_batch.check_experience", _accept),
         ):
             return self._learn()
@@ -167,7 +167,7 @@ def _time_calls(turns: _Turns) -> dict[str, list[float]]:
         return mock.patch.object(owner, name, call)
 
     with (
-        timed(sac_flow, "check_step"),
+        timed(guarded, "check_step"),
         timed(seed_batch, "check_experience"),
         timed(TrainingGuard, "before_updates"),
         timed(TrainingGuard, "after_updates"),
