@@ -54,10 +54,14 @@ CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {
             "stock": "MlpPolicy",
             "lowrank": on_policy.LowRankActorCriticPolicy,
             "flow": on_policy.FlowActorCriticPolicy,
+            "lowrank-clipped": on_policy.LowRankActorCriticPolicy,
+            "flow-clipped": on_policy.FlowActorCriticPolicy,
         },
     ),
 }
 """Algorithm -> its class, and the policies that are compared."""
+
+_CLIPPED = "-clipped"  # as SB3's PPO does it, where ours squashes
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,9 @@ def train(task: Task, algorithm: str, policy: str, seed: int, n_episodes: int) -
     algorithm_class, policies = CONTENDERS[algorithm]
     settings = dict(task.settings[algorithm])
     count = settings.pop("n_envs", 1)
+    if policy.endswith(_CLIPPED):
+        policy_kwargs = {**settings.get("policy_kwargs", {}), "squash_output": False}
+        settings["policy_kwargs"] = policy_kwargs
     venv = make_vec_env(task.env_id, count, seed, env_kwargs=task.env_kwargs)
     test_venv = make_vec_env(task.env_id, 1, 10**6 + seed, env_kwargs=task.env_kwargs)
     if algorithm in task.normalize:
@@ -207,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("--task", choices=list(TASKS), default="pendulum")
     add("--algorithms", choices=list(CONTENDERS), nargs="+", help="default: all of the task's")
-    policies = ["stock", "gauss", "lowrank", "flow"]
+    policies = list(dict.fromkeys(name for _, known in CONTENDERS.values() for name in known))
     add("--policies", choices=policies, nargs="+", help="those that an algorithm has; default: all")
     add("--seeds", type=int, nargs="+", default=[1, 2, 3])
     add("--episodes", type=int, default=10, help="episodes per test")

@@ -13,7 +13,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # As in the figures of the experiments; "stock" is the algorithm's own policy.
-_COLOURS = {"stock": "#000000", "gauss": "#d55e00", "lowrank": "#009e73", "flow": "#0072b2"}
+_COLOURS = {
+    "stock": "#000000",
+    "gauss": "#d55e00",
+    "lowrank": "#009e73",
+    "flow": "#0072b2",
+    "lowrank-clipped": "#8fd3b6",
+    "flow-clipped": "#56b4e9",
+}
 
 
 def learning_curves(rows: Sequence[Sequence[str]]) -> Figure:
