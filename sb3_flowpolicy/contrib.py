@@ -14,11 +14,19 @@ from sb3_flowpolicy.checkpoint import Resumable
 from sb3_flowpolicy.exploration import ColoredExploration
 from sb3_flowpolicy.guarded import Guarded
 from sb3_flowpolicy.policies import contrib as policies
-from sb3_flowpolicy.settings import SETTINGS, check_policy, check_settings, integer
+from sb3_flowpolicy.settings import SETTINGS, check_policy, check_settings, flag, integer, number
 
 _POLICY_BASES = {TQC: TQCPolicy, CrossQ: CrossQPolicy}
 
 _FURTHER = {"top_quantiles_to_drop_per_net": integer(0), "policy_delay": integer(1)}
+
+# CrossQ's, in policy_kwargs.
+_NORMALIZATION = {
+    "batch_norm": flag,
+    "batch_norm_momentum": number(0, 1),
+    "batch_norm_eps": number(0, above=True),
+    "renorm_warmup_steps": integer(0),
+}
 
 
 class _Checked(Guarded, Resumable, ColoredExploration):
@@ -32,6 +40,10 @@ class _Checked(Guarded, Resumable, ColoredExploration):
         given = {**dict(zip(names, args, strict=False)), **kwargs}
         check_settings(given, {**SETTINGS, **_FURTHER})
         check_policy(given.get("policy"), policy_base, self.policy_aliases)
+        policy_kwargs = given.get("policy_kwargs") or {}
+        for name, check in _NORMALIZATION.items():
+            if name in policy_kwargs:
+                check(name, policy_kwargs[name])
         try:
             super().__init__(*args, **kwargs)
         except AssertionError as error:  # how SB3 refuses an environment

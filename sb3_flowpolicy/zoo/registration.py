@@ -80,9 +80,9 @@ def _plug_into_utils(module: ModuleType) -> None:
 
 
 def _plug_into_hyperparams_opt(module: ModuleType) -> None:
-    from sb3_flowpolicy.zoo.samplers import CONVERTERS, SAMPLERS
+    from sb3_flowpolicy.zoo.samplers import CONVERTERS, SAMPLERS, refuse
 
-    module.HYPERPARAMS_SAMPLER.update(SAMPLERS)
+    module.HYPERPARAMS_SAMPLER.update({**SAMPLERS, "crossq_flow": refuse})
     module.HYPERPARAMS_CONVERTER.update(CONVERTERS)
 
 

@@ -111,8 +111,13 @@ SAMPLERS: dict[str, Sampler] = {
     "ppo_flow": _sampler(_suggest_flow, "ppo"),
     "ppo_lowrank": _sampler(_suggest_lowrank, "ppo"),
 }
-"""For `--optimize`; rl_zoo3 has none for CrossQ, and neither have we."""
+"""For `--optimize`."""
 
 CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     name: partial(convert, off_policy=not name.startswith("ppo")) for name in SAMPLERS
 }
+
+
+def refuse(*_: Any) -> dict[str, Any]:
+    """Raise `ValueError`: rl_zoo3 has no search space for CrossQ, and neither have we."""
+    raise ValueError(f"--algo must be one of {list(CONVERTERS)} to --optimize, got 'crossq_flow'")
