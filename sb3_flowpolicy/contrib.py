@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, ClassVar
 
 from sb3_contrib import TQC, CrossQ
@@ -14,7 +13,16 @@ from sb3_flowpolicy.checkpoint import Resumable
 from sb3_flowpolicy.exploration import ColoredExploration
 from sb3_flowpolicy.guarded import Guarded
 from sb3_flowpolicy.policies import contrib as policies
-from sb3_flowpolicy.settings import SETTINGS, check_policy, check_settings, flag, integer, number
+from sb3_flowpolicy.settings import (
+    SETTINGS,
+    assertions_as_value_errors,
+    by_name,
+    check_policy,
+    check_settings,
+    flag,
+    integer,
+    number,
+)
 
 _POLICY_BASES = {TQC: TQCPolicy, CrossQ: CrossQPolicy}
 
@@ -36,18 +44,12 @@ class _Checked(Guarded, Resumable, ColoredExploration):
         theirs, policy_base = next(
             (base, _POLICY_BASES[base]) for base in type(self).__mro__ if base in _POLICY_BASES
         )
-        names = list(inspect.signature(theirs).parameters)
-        given = {**dict(zip(names, args, strict=False)), **kwargs}
+        given = by_name(theirs, args, kwargs)
         check_settings(given, {**SETTINGS, **_FURTHER})
         check_policy(given.get("policy"), policy_base, self.policy_aliases)
-        policy_kwargs = given.get("policy_kwargs") or {}
-        for name, check in _NORMALIZATION.items():
-            if name in policy_kwargs:
-                check(name, policy_kwargs[name])
-        try:
+        check_settings(given.get("policy_kwargs") or {}, _NORMALIZATION)
+        with assertions_as_value_errors():
             super().__init__(*args, **kwargs)
-        except AssertionError as error:  # how SB3 refuses an environment
-            raise ValueError(str(error)) from error
 
 
 class TQCFlow(_Checked, TQC):

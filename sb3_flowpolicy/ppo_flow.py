@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -12,10 +11,15 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 
 from sb3_flowpolicy.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy as policies
-from sb3_flowpolicy.settings import PPO_SETTINGS, check_policy, check_settings
+from sb3_flowpolicy.settings import (
+    PPO_SETTINGS,
+    assertions_as_value_errors,
+    by_name,
+    check_policy,
+    check_settings,
+)
 
 _COLORED = ("action_noise_color", "action_noise_correlation_time")
-_ARGUMENTS = list(inspect.signature(PPO).parameters)
 
 
 class PPOFlow(PPO):
@@ -54,14 +58,12 @@ class PPOFlow(PPO):
     }
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        given = {**dict(zip(_ARGUMENTS, args, strict=False)), **kwargs}
+        given = by_name(PPO, args, kwargs)
         _refuse_colored_noise(given)
         check_settings(given, PPO_SETTINGS)
         check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
-        try:
+        with assertions_as_value_errors():
             super().__init__(*args, **kwargs)
-        except AssertionError as error:  # how SB3 refuses an environment, or a lone step
-            raise ValueError(str(error)) from error
 
     def _setup_model(self) -> None:
         _refuse_colored_noise(vars(self))  # what load() was given

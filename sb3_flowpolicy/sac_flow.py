@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,15 +30,18 @@ from sb3_flowpolicy.engine.subnormals import flushed_subnormals
 from sb3_flowpolicy.exploration import ColoredExploration
 from sb3_flowpolicy.guarded import Guarded
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
-from sb3_flowpolicy.settings import check_policy, check_settings
+from sb3_flowpolicy.settings import (
+    assertions_as_value_errors,
+    by_name,
+    check_policy,
+    check_settings,
+)
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
 # Compiling takes 10 to 30 seconds and saves one to five milliseconds per update.
 UPDATES_WORTH_COMPILING = 10_000
 MOST_DRAWN_AT_ONCE = 1000
-# Names of SAC's arguments after self, policy and env, for those that come by position.
-_SAC_ARGUMENTS = list(inspect.signature(SAC.__init__).parameters)[3:]
 
 
 class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
@@ -123,8 +125,7 @@ class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
         check_policy(policy, SACPolicy, self.policy_aliases)
         check_settings(
             {
-                **dict(zip(_SAC_ARGUMENTS, sac_args, strict=False)),
-                **sac_kwargs,
+                **by_name(SAC, (policy, env, *sac_args), sac_kwargs),
                 "random_steps": random_steps,
                 "critic_loss_coef": critic_loss_coef,
                 "compile": compile,
@@ -146,7 +147,7 @@ class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
             if demonstrations is None or is_recipe(demonstrations)
             else load_demonstrations(demonstrations)
         )
-        try:
+        with assertions_as_value_errors():
             super().__init__(
                 policy,
                 env,
@@ -155,8 +156,6 @@ class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
                 action_noise_correlation_time=action_noise_correlation_time,
                 **sac_kwargs,
             )
-        except AssertionError as error:  # how SB3 refuses an environment
-            raise ValueError(str(error)) from error
 
     def add_demonstrations(self, demonstrations: str | Path | Mapping[str, np.ndarray]) -> int:
         """Append transitions to the replay buffer (thesis section 3.3.3).

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ from sb3_flowpolicy.noise_process import MAX_COLOR
 #: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
 
-
-_ANY = 2**53  # what a JSON number holds without rounding
+# What a JSON number holds without rounding.
+_ANY = 2**53
 
 
 def integer(least: int, most: int = _ANY) -> Check:
@@ -189,9 +190,7 @@ PPO_SETTINGS: dict[str, Check] = {
 }
 
 
-def check_settings(
-    settings: Mapping[str, Any], table: Mapping[str, Check] = MappingProxyType(SETTINGS)
-) -> None:
+def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check] = SETTINGS) -> None:
     """Check those arguments of an algorithm that are known here.
 
     Args:
@@ -211,6 +210,26 @@ def check_settings(
     for name, check in {**table, **_FURTHER}.items():
         if name in settings:
             check(name, settings[name])
+
+
+def by_name(algorithm: type, args: Iterable[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of an algorithm's constructor by name, those by position as well.
+
+    Example:
+        >>> from stable_baselines3 import SAC
+        >>> by_name(SAC, ["MlpPolicy", "Pendulum-v1"], {"gamma": 0.9})
+        {'policy': 'MlpPolicy', 'env': 'Pendulum-v1', 'gamma': 0.9}
+    """
+    return {**dict(zip(inspect.signature(algorithm).parameters, args, strict=False)), **kwargs}
+
+
+@contextmanager
+def assertions_as_value_errors() -> Iterator[None]:
+    """Turn ``AssertionError``, by which SB3 refuses environments, into ``ValueError``."""
+    try:
+        yield
+    except AssertionError as error:
+        raise ValueError(str(error)) from error
 
 
 def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:

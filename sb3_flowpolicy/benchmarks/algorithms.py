@@ -61,7 +61,9 @@ CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 """Algorithm -> its class, and the policies that are compared."""
 
-_CLIPPED = "-clipped"  # as SB3's PPO does it, where ours squashes
+# As SB3's PPO bounds actions, where ours squash them.
+_CLIPPED = {"squash_output": False}
+_POLICY_KWARGS = {"lowrank-clipped": _CLIPPED, "flow-clipped": _CLIPPED}
 
 
 @dataclass(frozen=True)
@@ -155,16 +157,15 @@ def train(task: Task, algorithm: str, policy: str, seed: int, n_episodes: int) -
     algorithm_class, policies = CONTENDERS[algorithm]
     settings = dict(task.settings[algorithm])
     count = settings.pop("n_envs", 1)
-    if policy.endswith(_CLIPPED):
-        policy_kwargs = {**settings.get("policy_kwargs", {}), "squash_output": False}
-        settings["policy_kwargs"] = policy_kwargs
+    policy_kwargs = {**settings.pop("policy_kwargs", {}), **_POLICY_KWARGS.get(policy, {})}
     venv = make_vec_env(task.env_id, count, seed, env_kwargs=task.env_kwargs)
     test_venv = make_vec_env(task.env_id, 1, 10**6 + seed, env_kwargs=task.env_kwargs)
     if algorithm in task.normalize:
         gamma = settings.get("gamma", 0.99)
         venv = VecNormalize(venv, gamma=gamma)
         test_venv = VecNormalize(test_venv, training=False, norm_reward=False)
-    model = algorithm_class(policies[policy], venv, seed=seed, device="cpu", **settings)
+    settings |= {"policy_kwargs": policy_kwargs, "seed": seed, "device": "cpu"}
+    model = algorithm_class(policies[policy], venv, **settings)
     started, rows = time.perf_counter(), []
     for _ in range(_LOOKS):
         model.learn(task.steps[algorithm] // _LOOKS, reset_num_timesteps=False)

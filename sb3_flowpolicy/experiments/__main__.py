@@ -87,11 +87,12 @@ def _run(args: argparse.Namespace) -> None:
     )
     out = args.out or OUT[args.profile]
     with results_folder(out, plan) as folder:
-        adopted = adopt(folder, unfinished(folder, plan))
+        left = unfinished(folder, plan)
+        adopted = adopt(folder, left)
         for source in sorted(set(adopted.values())):
             shared = [key for key, name in adopted.items() if name == source]
             print(f"Taken from {source}, which did the same: {', '.join(shared)}")
-        items = unfinished(folder, plan)
+        items = [item for item in left if item.key not in adopted]
         finished = {item.key for item in plan.items} - {item.key for item in items}
         print(
             f"{experiment.name} ({experiment.claim}): {len(plan.items)} items of {plan.steps:,} "

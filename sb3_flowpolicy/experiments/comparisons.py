@@ -7,8 +7,18 @@ from collections.abc import Sequence
 
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent, Check, Finding
-from sb3_flowpolicy.experiments.statistics import interquartile_mean, probability_of_improvement
+from sb3_flowpolicy.experiments.statistics import (
+    Estimate,
+    interquartile_mean,
+    probability_of_improvement,
+)
 from sb3_flowpolicy.experiments.tables import WORDS, in_digits
+
+
+def _listed(metric: str, agents: Sequence[Agent], means: Sequence[Estimate]) -> str:
+    return "; ".join(
+        f"{a.label} {in_digits(metric, m)}" for a, m in zip(agents, means, strict=True)
+    )
 
 
 def ordered(setting: str, metric: str, agents: Sequence[Agent], margin: float = 0.0) -> Check:
@@ -31,9 +41,7 @@ def ordered(setting: str, metric: str, agents: Sequence[Agent], margin: float = 
         )
         return Finding(
             falls and all(bool(chance.low > 0.5) for chance in chances),
-            "; ".join(
-                f"{a.label} {in_digits(metric, m)}" for a, m in zip(agents, means, strict=True)
-            )
+            _listed(metric, agents, means)
             + "; probability of improvement "
             + ", ".join(f"{chance:.2f}" for chance in chances),
         )
@@ -54,10 +62,7 @@ def about_equal(setting: str, metric: str, agents: Sequence[Agent], tolerance: f
         means = [interquartile_mean(evidence.final(setting, a.name, metric)) for a in agents]
         values = [float(mean.value) for mean in means]
         equal = max(values) - min(values) <= tolerance * max(abs(value) for value in values)
-        listed = "; ".join(
-            f"{a.label} {in_digits(metric, m)}" for a, m in zip(agents, means, strict=True)
-        )
-        return Finding(equal, listed)
+        return Finding(equal, _listed(metric, agents, means))
 
     words = WORDS.get(metric, metric)
     return Check(
@@ -75,8 +80,7 @@ def at_least_times(setting: str, metric: str, more: Agent, less: Agent, factor: 
         )
         holds = float(a.value) >= factor * float(b.value)
         ratio = f", {float(a.value) / float(b.value):.2f} times" if b.value > 0 else ""
-        told = [f"{one.label} {in_digits(metric, m)}" for one, m in ((more, a), (less, b))]
-        return Finding(holds, f"{told[0]}; {told[1]}{ratio}")
+        return Finding(holds, _listed(metric, (more, less), (a, b)) + ratio)
 
     words = WORDS.get(metric, metric)
     return Check(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from sb3_flowpolicy.experiments.comparisons import at_least_times, ordered
@@ -56,7 +57,7 @@ _TUNNELS = {
 }
 # A fifth of the time: see the notes of exploration-square.
 _SMALLER = {"gradient_steps": 50, "policy_kwargs": {"net_arch": [128, 128]}}
-_GSDE_HALF = Agent(GSDE.name, GSDE.label, GSDE.algo, {**GSDE.overrides, "gradient_steps": 4})
+_GSDE_HALF = replace(GSDE, overrides={**GSDE.overrides, "gradient_steps": 4})
 _ON_SQUARE = tuple(_GSDE_HALF if agent == GSDE else agent for agent in EXPLORERS)
 _WITH_ENTROPY = tuple(agent for agent in EXPLORERS if agent not in (GAUSS, GSDE))
 
@@ -90,7 +91,7 @@ EXPLORATION_CLAIMS = (
         settings=(Setting("move-x", "SquareMoveX-v0", overrides=_SMALLER),),
         agents=_ON_SQUARE,
         checks=(
-            *(at_least_times("move-x", "x_std", agent, GAUSS, 1.5) for agent in EXPLORERS[1:]),
+            *(at_least_times("move-x", "x_std", agent, GAUSS, 1.5) for agent in _ON_SQUARE[1:]),
             *(ordered("move-x", "entropy", (agent, GAUSS)) for agent in _WITH_ENTROPY),
         ),
         steps=30_000,
