@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch as th
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.logger import configure
@@ -20,7 +20,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import BundleError, SACFlow
 from sb3_flowpolicy.distributions import registered_distributions
-from sb3_flowpolicy.sac_flow import _SAC_ARGUMENTS
 from sb3_flowpolicy.settings import SETTINGS
 from tests.bundle.conftest import FAST, NET, UNUSUAL, behind_statistics, make_model, multi_env
 
@@ -230,7 +229,8 @@ def test_every_argument_of_the_constructor_is_held_or_left_out_on_purpose() -> N
     import inspect
 
     own = [*inspect.signature(SACFlow.__init__).parameters]
-    known = {*_SAC_ARGUMENTS, *own} - {"self", "policy", "env", "sac_args", "sac_kwargs"}
+    theirs = [*inspect.signature(SAC).parameters]
+    known = {*theirs, *own} - {"self", "policy", "env", "sac_args", "sac_kwargs"}
     elsewhere = {"learning_rate", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
     refused = {"action_noise"}
     left_out = {"demonstrations", "tensorboard_log", "verbose", "device", "_init_setup_model"}

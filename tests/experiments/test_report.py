@@ -203,6 +203,8 @@ def test_the_page_works_offline_in_a_browser(make_up: MakeUp, tmp_path: Path) ->
                 "--enable-logging=stderr",
                 f"--user-data-dir={tmp_path / f'profile-{width}'}",
                 f"--window-size={width},30000",
+                # A busy machine may else run out of virtual time before the first frame.
+                "--run-all-compositor-stages-before-draw",
                 "--virtual-time-budget=30000",
                 "--dump-dom",
                 page.as_uri(),
