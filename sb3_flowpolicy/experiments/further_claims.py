@@ -35,6 +35,7 @@ def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:
         settings=(Setting(setting, env_id),),
         checks=tuple(reaches(setting, "test_return", agent, published) for agent in AGENTS),
         steps=1_000_000,
+        seeds=3,
         eval_every=20_000,
         notes=f"The bar is the return that SB3 publishes for its SAC, {published}.",
     )

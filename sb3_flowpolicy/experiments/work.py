@@ -16,7 +16,8 @@ from sb3_flowpolicy.hyperparameters import load_hyperparameters
 FIRST_SEED = 1
 SEEDS_PER_ITEM = 10
 QUICK_STEPS, QUICK_SEEDS = 3000, 2
-CHECKPOINTS = 6
+# Short runs write this many checkpoints, long ones one per so many steps.
+CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS = 6, 50_000
 # Raised whenever the files of a run change their meaning.
 SCHEMA = 1
 
@@ -144,6 +145,7 @@ def _item(
         hyperparameters = merge(hyperparameters, overrides)
     # A short run is measured more often, or there would be no curve to look at.
     eval_every = max(1, min(experiment.eval_every, steps // 6))
+    between_checkpoints = min(steps / CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS)
     return WorkItem(
         key=f"{setting.name}-{agent.name}" + (f"-seeds-{seeds[0]}-{seeds[-1]}" if split else ""),
         setting=setting.name,
@@ -154,7 +156,7 @@ def _item(
         hyperparameters=hyperparameters,
         steps=steps,
         eval_every=eval_every,
-        checkpoint_every=eval_every * max(1, round(steps / eval_every / CHECKPOINTS)),
+        checkpoint_every=eval_every * max(1, round(between_checkpoints / eval_every)),
         test_episodes=experiment.test_episodes,
         measures=experiment.measures,
         pictures_at=tuple(round(share * steps) for share in experiment.pictures_at),
