@@ -12,6 +12,7 @@ from sb3_flowpolicy.experiments.exploration_claims import EXPLORATION_CLAIMS
 from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS
 from sb3_flowpolicy.experiments.measures import MEASURES, TRAINING_INFOS
 from sb3_flowpolicy.experiments.tunnel_claims import TUNNEL_CLAIMS
+from sb3_flowpolicy.experiments.work import register_env
 
 EXPERIMENTS: dict[str, Experiment] = {
     one.name: one
@@ -47,11 +48,10 @@ def find(name: str) -> Experiment:
 def what_is_missing(experiment: Experiment) -> str | None:
     """Say what an experiment needs that is not here; None if it can run."""
     for setting in experiment.settings:
-        if setting.env_id.endswith("BulletEnv-v0"):
-            try:
-                import pybullet_envs_gymnasium  # noqa: F401, registers the environments
-            except ModuleNotFoundError:
-                return 'PyBullet: pip install "sb3_flowpolicy[bullet]"'
+        try:
+            register_env(setting.env_id)
+        except ModuleNotFoundError:
+            return 'PyBullet: pip install "sb3_flowpolicy[bullet]"'
         if setting.env_id not in gym.registry:
             return f"the environment {setting.env_id}"
     unknown = [name for name in experiment.measures if name not in _KNOWN_MEASURES]

@@ -177,6 +177,18 @@ def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, An
     return merged
 
 
+def register_env(env_id: str) -> None:
+    """Register the PyBullet environments if ``env_id`` is one of them.
+
+    Every process that makes environments needs this: registrations do not travel.
+
+    Raises:
+        ModuleNotFoundError: If PyBullet is needed and not installed.
+    """
+    if env_id.endswith("BulletEnv-v0"):
+        import pybullet_envs_gymnasium  # noqa: F401
+
+
 def describe(item: WorkItem) -> dict[str, Any]:
     """Return everything that the item's results depend on."""
     described = {name: value for name, value in vars(item).items() if name != "key"}
@@ -193,6 +205,7 @@ def environment(item: WorkItem) -> str:
 
     An id, not a factory: only ids lead to an environment's vectorised form.
     """
+    register_env(item.env_id)
     if not item.env_kwargs:
         return item.env_id
     base = gym.spec(item.env_id)

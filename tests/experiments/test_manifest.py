@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -78,3 +81,15 @@ def test_costs_add_up() -> None:
     assert plan_seconds(plan, 1) == pytest.approx(sum(seconds))
     assert plan_seconds(plan, 100) == max(seconds)
     assert in_words(60 * 45) == "45 min"
+
+
+def test_a_worker_process_can_make_bullet_environments() -> None:
+    pytest.importorskip("pybullet_envs_gymnasium")
+    code = (
+        "import gymnasium as gym\n"
+        "from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS\n"
+        "from sb3_flowpolicy.experiments.work import environment, make_plan\n"
+        "print(gym.spec(environment(make_plan(FURTHER_CLAIMS[0]).items[0])).id)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stdout.endswith("Walker2DBulletEnv-v0\n"), result.stderr
