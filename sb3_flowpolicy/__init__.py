@@ -9,12 +9,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_flowpolicy.algorithms.contrib import CrossQFlow, TQCFlow
+    from sb3_flowpolicy.algorithms.ppo_flow import PPOFlow
+    from sb3_flowpolicy.algorithms.sac_flow import SACFlow
     from sb3_flowpolicy.bundle import BundleError
     from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
-    from sb3_flowpolicy.contrib import CrossQFlow, TQCFlow
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
     from sb3_flowpolicy.export import export_onnx
-    from sb3_flowpolicy.finite import NonFiniteError
+    from sb3_flowpolicy.guard.finite import NonFiniteError
     from sb3_flowpolicy.policies import (
         CnnFlowPolicy,
         CnnGaussPolicy,
@@ -48,9 +50,7 @@ if TYPE_CHECKING:
         MultiInputFlowActorCriticPolicy,
         MultiInputLowRankActorCriticPolicy,
     )
-    from sb3_flowpolicy.ppo_flow import PPOFlow
-    from sb3_flowpolicy.sac_flow import SACFlow
-    from sb3_flowpolicy.seed_batch import SeedBatch
+    from sb3_flowpolicy.seeds.batch import SeedBatch
 
 __version__ = "0.1.0"
 
@@ -104,7 +104,7 @@ _ELSEWHERE = {
     "CnnGaussTQCPolicy": "policies.contrib",
     "CnnLowRankActorCriticPolicy": "policies.on_policy",
     "CnnLowRankTQCPolicy": "policies.contrib",
-    "CrossQFlow": "contrib",
+    "CrossQFlow": "algorithms.contrib",
     "FlowActorCriticPolicy": "policies.on_policy",
     "FlowCrossQPolicy": "policies.contrib",
     "FlowTQCPolicy": "policies.contrib",
@@ -118,12 +118,12 @@ _ELSEWHERE = {
     "MultiInputGaussTQCPolicy": "policies.contrib",
     "MultiInputLowRankActorCriticPolicy": "policies.on_policy",
     "MultiInputLowRankTQCPolicy": "policies.contrib",
-    "NonFiniteError": "finite",
-    "PPOFlow": "ppo_flow",
+    "NonFiniteError": "guard",
+    "PPOFlow": "algorithms.ppo_flow",
     "RunCheckpointCallback": "checkpoint",
-    "SACFlow": "sac_flow",
-    "SeedBatch": "seed_batch",
-    "TQCFlow": "contrib",
+    "SACFlow": "algorithms.sac_flow",
+    "SeedBatch": "seeds.batch",
+    "TQCFlow": "algorithms.contrib",
     "export_onnx": "export",
     "has_checkpoint": "checkpoint",
     "register_distribution": "distributions",

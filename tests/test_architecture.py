@@ -11,37 +11,22 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A package may import those before it, and nothing after.
-FLOORS = [
-    "finite",
-    "noise_process",
-    "distributions",
-    "density",
-    "policies",
+LIBRARY = [
+    "common",
     "guard",
+    "distributions",
+    "policies",
     "engine",
-    "guarded",
-    "settings",
     "bundle",
-    "demonstrations",
-    "vec_env",
     "checkpoint",
-    "exploration",
-    "contrib",
-    "ppo_flow",
-    "sac_flow",
+    "algorithms",
     "export",
-    "seed_episodes",
-    "seed_setup",
-    "seed_checkpoint",
-    "seed_on_disk",
-    "seed_batch",
-    "hyperparameters",
-    "train_seeds",
+    "seeds",
     "diagnostics",
-    "benchmarks",
     "zoo",
-    "experiments",
 ]
+RESEARCH = ["density", "benchmarks", "experiments"]
+FLOORS = LIBRARY + RESEARCH
 THIRD_PARTY = {
     "distributions": {"torch"},
     "density": {"torch", "numpy", "scipy", "sklearn", "matplotlib", "PIL", "tqdm"},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types

@@ -15,10 +15,10 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.policies import FlowActor
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 ALGO, ENV = "sac_flow", "TunnelDiagonal-v0"
 COLUMNS = ("how", "seed", "step", "success", "entropy")

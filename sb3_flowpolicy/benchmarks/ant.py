@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.finite import NonFiniteError
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.guard.finite import NonFiniteError
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 ENV_ID = "AntBulletEnv-v0"
 POLICIES = {

@@ -8,10 +8,10 @@ from typing import Any
 from stable_baselines3 import SAC
 
 import flowpolicy_envs
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 ENV_ID = "TunnelDiagonal-v0"
 N_SEEDS = 10

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import os
-import platform
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch as th
-
-import sb3_flowpolicy
 from sb3_flowpolicy.benchmarks.timing import Contest, Timing
+from sb3_flowpolicy.common.files import write_json
 
 # Raised whenever a field changes its meaning.
 SCHEMA = 1
-PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "zuko", "sbx-rl")
 
 
 @dataclass(frozen=True)
@@ -114,73 +104,12 @@ def table(found: Sequence[Row]) -> str:
     return "\n".join(text)
 
 
-def machine() -> dict[str, Any]:
-    """Return what a reader needs to know about where the numbers were measured."""
-    return {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "platform": platform.platform(),
-        "processor": _processor(),
-        "cpu_count": os.cpu_count(),
-        # Processes that wanted to run, averaged over a minute: above 0 means others were busy.
-        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "threads": th.get_num_threads(),
-        "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES},
-        "commit": _commit(),
-    }
-
-
-def write_json(path: Path, content: dict[str, Any], found: Sequence[Row]) -> None:
-    """Write the file at once or not at all, so that nobody ever reads half of it.
+def write_results(path: Path, content: dict[str, Any], found: Sequence[Row]) -> None:
+    """Write machine, settings and rows.
 
     Args:
         path: File to write; its directory exists.
         content: Machine and settings.
         found: All rows so far.
     """
-    text = json.dumps(
-        {"schema": SCHEMA, **content, "rows": [asdict(row) for row in found]}, indent=1
-    )
-    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text + "\n")
-        # mkstemp's files are for their owner alone; ours is an ordinary one.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
-
-
-def _commit() -> str | None:
-    """Return the commit of the source tree; None where the package was installed from a wheel."""
-    source = Path(sb3_flowpolicy.__file__)
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(source.parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", source.name)  # the tree around may be someone else's
-        return git("describe", "--always", "--dirty", "--abbrev=12")
-    except (OSError, subprocess.CalledProcessError):
-        return None
+    write_json(path, {"schema": SCHEMA, **content, "rows": [asdict(row) for row in found]})

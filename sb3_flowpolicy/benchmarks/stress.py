@@ -20,10 +20,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.logger import configure
 
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.distributions import registered_distributions
-from sb3_flowpolicy.finite import NonFiniteError
+from sb3_flowpolicy.guard.finite import NonFiniteError
 from sb3_flowpolicy.policies import FlowActor, FlowPolicy
-from sb3_flowpolicy.sac_flow import SACFlow
 
 N_TRANSITIONS, OBS_DIM = 1000, 5
 UPDATES, UPDATES_BETWEEN_LOOKS = 2000, 100

@@ -15,8 +15,9 @@ from typing import Any
 
 import torch as th
 
-from sb3_flowpolicy.benchmarks.report import Row, machine, rows, table, write_json
+from sb3_flowpolicy.benchmarks.report import Row, rows, table, write_results
 from sb3_flowpolicy.benchmarks.timing import MIN_ROUNDS, Progress, race
+from sb3_flowpolicy.common.machine import machine
 
 # Group -> module with its contests. In the order in which they run: zuko, which changes torch for
 # the whole process when imported, comes last.
@@ -99,7 +100,7 @@ def _run(
             found += new
             print(table(new), end="\n\n", flush=True)
             if path is not None:  # after each contest: an interrupted run keeps what it has
-                write_json(path, content, found)
+                write_results(path, content, found)
 
 
 class _Progress:

@@ -17,15 +17,16 @@ import numpy as np
 import torch as th
 
 import flowpolicy_envs
-from sb3_flowpolicy import guarded, seed_batch
+from sb3_flowpolicy.algorithms import guarded
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 from sb3_flowpolicy.benchmarks.updates import Unmoved
 from sb3_flowpolicy.benchmarks.zoo_blocks import zoo_block
-from sb3_flowpolicy.guard import UPDATES_BETWEEN_LOOKS, TrainingGuard
+from sb3_flowpolicy.guard.training_guard import UPDATES_BETWEEN_LOOKS, TrainingGuard
 from sb3_flowpolicy.policies import DistributionPolicy
 from sb3_flowpolicy.policies.deterministic import MODES
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.seeds import batch as seed_batch
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 ENV_ID = "TunnelDiagonal-v0"
 CHUNK, QUICK_CHUNK = 1000, 10
@@ -92,8 +93,8 @@ class _Turns:
     def unwatched(self) -> float:
         self.models._guard = _Blind()
         with (
-            mock.patch("sb3_flowpolicy.guarded.check_step", _accept),
-            mock.patch("sb3_flowpolicy.seed_batch.check_experience", _accept),
+            mock.patch("sb3_flowpolicy.algorithms.guarded.check_step", _accept),
+            mock.patch("sb3_flowpolicy.seeds.batch.check_experience", _accept),
         ):
             return self._learn()
 

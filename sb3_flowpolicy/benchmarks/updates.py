@@ -12,12 +12,12 @@ import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.limit import products_alone
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, UnavailableError, Work
 from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
 from sb3_flowpolicy.engine import Engine
 from sb3_flowpolicy.policies import FlowPolicy
-from sb3_flowpolicy.sac_flow import SACFlow
 
 BATCH_SIZE = 256
 # Per call of train(): as if an episode had just ended.

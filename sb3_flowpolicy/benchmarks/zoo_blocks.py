@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_flowpolicy.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 
 # What SB3's SAC does not have.
 _OURS = ("random_steps", "critic_loss_coef")

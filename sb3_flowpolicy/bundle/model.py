@@ -38,8 +38,8 @@ from sb3_flowpolicy.bundle.policy_spec import (
 from sb3_flowpolicy.bundle.replay_spec import buffer_from_spec, buffer_to_spec
 from sb3_flowpolicy.bundle.schedules import rate_from_spec, rate_to_spec
 from sb3_flowpolicy.bundle.space_specs import space_from_spec, space_to_spec
+from sb3_flowpolicy.common.settings import SETTINGS, Check, integer, number
 from sb3_flowpolicy.policies import DistributionPolicy
-from sb3_flowpolicy.settings import SETTINGS, Check, integer, number
 
 SUFFIX = ".safetensors"
 FORMAT = 1

@@ -12,10 +12,10 @@ from typing import Any
 import torch as th
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.experiments.measures import DeterministicEpisodes, own_random_numbers
-from sb3_flowpolicy.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.policies.deterministic import MODES
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 WAYS = (*MODES, "stochastic")
 COLUMNS = ("env", "ent_coef", "seed", "step", "way", "success", "return")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.json_files import write_text
 from sb3_flowpolicy.experiments.section import METHOD, Section, png, read_results
 from sb3_flowpolicy.experiments.tables import Table
 

@@ -15,9 +15,9 @@ import numpy as np
 import torch as th
 from gymnasium.vector import VectorEnv
 
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.policies import FlowActor
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_setup import make_env, make_vec_env
+from sb3_flowpolicy.seeds.setup import make_env, make_vec_env
 
 N_STATES, N_SAMPLES = 256, 64
 PROFILE_POINTS, PROFILE_SAMPLES = 36, 512

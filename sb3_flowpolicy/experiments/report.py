@@ -7,8 +7,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.experiments.experiment import NOT_MEASURED
-from sb3_flowpolicy.experiments.json_files import write_text
 from sb3_flowpolicy.experiments.section import METHOD, Section, png, read_results
 
 if TYPE_CHECKING:

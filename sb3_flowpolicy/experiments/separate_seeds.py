@@ -10,8 +10,8 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_setup import make_env
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.seeds.setup import make_env
 
 
 class SeparateSeeds:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sb3_flowpolicy.experiments.json_files import read_json, require, write_json
+from sb3_flowpolicy.common.files import read_json, require, write_json
 from sb3_flowpolicy.experiments.work import SCHEMA
 
 FILE_NAME = "settings.json"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_flowpolicy.benchmarks.report import machine
+from sb3_flowpolicy.common.machine import machine
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.settings_file import read_settings
 from sb3_flowpolicy.experiments.store import ItemFiles

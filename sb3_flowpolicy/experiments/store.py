@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_flowpolicy.experiments.json_files import read_json, require, write_json
+from sb3_flowpolicy.common.files import read_json, require, write_json
 
 BASIC_COLUMNS = (
     "seed",
@@ -45,7 +45,7 @@ DONE_FIELDS = {
         **{"processor": str, "python": str, "versions": dict},
     },
 }
-"""What ``KEY.done.json`` holds, see :func:`~sb3_flowpolicy.experiments.json_files.require`."""
+"""What ``KEY.done.json`` holds, see :func:`~sb3_flowpolicy.common.files.require`."""
 
 DETAIL_FIELDS = {
     "profile": {"seed": int, "way": list, "entropy": list},

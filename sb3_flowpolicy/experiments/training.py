@@ -11,8 +11,9 @@ import numpy as np
 import torch as th
 from filelock import FileLock, Timeout
 
-from sb3_flowpolicy.benchmarks.report import machine
-from sb3_flowpolicy.experiments.json_files import read_json, write_json
+from sb3_flowpolicy.algorithms.sac_flow import UPDATES_WORTH_COMPILING, SACFlow
+from sb3_flowpolicy.common.files import read_json, write_json
+from sb3_flowpolicy.common.machine import machine
 from sb3_flowpolicy.experiments.measures import (
     MEASURES,
     TRAINING_INFOS,
@@ -24,8 +25,7 @@ from sb3_flowpolicy.experiments.measures import (
 from sb3_flowpolicy.experiments.separate_seeds import SeparateSeeds
 from sb3_flowpolicy.experiments.store import ItemFiles, Row
 from sb3_flowpolicy.experiments.work import WorkItem, environment
-from sb3_flowpolicy.sac_flow import UPDATES_WORTH_COMPILING, SACFlow
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 Report = Callable[[str, int], None]
 """Called with an item's key and the steps that each of its seeds has done."""

@@ -10,8 +10,8 @@ from typing import Any
 import gymnasium as gym
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.experiments.experiment import Agent, Experiment, Setting
-from sb3_flowpolicy.hyperparameters import load_hyperparameters
 
 FIRST_SEED = 1
 SEEDS_PER_ITEM = 10

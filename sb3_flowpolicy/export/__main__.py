@@ -11,9 +11,9 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.bundle.model import SUFFIX
 from sb3_flowpolicy.export.onnx_export import export_onnx
-from sb3_flowpolicy.sac_flow import SACFlow
 
 _EXAMPLES = """\
 examples:

@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_flowpolicy.distributions.base import positive_int
-from sb3_flowpolicy.finite import all_finite, check_observation
+from sb3_flowpolicy.guard.finite import all_finite, check_observation
 from sb3_flowpolicy.policies.actor import FlowActor
 from sb3_flowpolicy.policies.deterministic import (
     DETERMINISTIC_DEFAULTS,

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
-from sb3_flowpolicy.finite import all_finite
+from sb3_flowpolicy.guard.finite import all_finite
 from sb3_flowpolicy.policies.extractors import check_observation_space, for_dicts, for_images
 from sb3_flowpolicy.policies.off_policy import check_finite_actions, check_net_arch
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter

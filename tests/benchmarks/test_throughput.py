@@ -10,12 +10,12 @@ import pytest
 import torch as th
 from torch.utils.flop_counter import FlopCounterMode
 
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks import environments, flows, learning, trust, updates
 from sb3_flowpolicy.benchmarks.limit import products_alone
 from sb3_flowpolicy.benchmarks.report import Row
 from sb3_flowpolicy.benchmarks.throughput import GROUPS, main
 from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
-from sb3_flowpolicy.sac_flow import SACFlow
 
 MODULES = (updates, learning, environments, trust, flows)
 

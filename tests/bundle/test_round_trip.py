@@ -19,8 +19,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import BundleError, SACFlow
+from sb3_flowpolicy.common.settings import SETTINGS
 from sb3_flowpolicy.distributions import registered_distributions
-from sb3_flowpolicy.settings import SETTINGS
 from tests.bundle.conftest import FAST, NET, UNUSUAL, behind_statistics, make_model, multi_env
 
 OURS = ["gaussian", "low_rank", "full_covariance", "lattice", "realnvp", "spline"]

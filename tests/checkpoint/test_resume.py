@@ -25,7 +25,7 @@ from stable_baselines3.sac.policies import SACPolicy
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.checkpoint import RunCheckpointCallback
-from sb3_flowpolicy.vec_env import make_batched_env
+from sb3_flowpolicy.common.vec_env import make_batched_env
 from tests.checkpoint.kill_and_resume import _outcome, _rows
 
 ENV = "TunnelDiagonal-v0"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_flowpolicy.experiments.json_files import write_json
+from sb3_flowpolicy.common.files import write_json
 from sb3_flowpolicy.experiments.settings_file import claim_folder
 from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from sb3_flowpolicy.benchmarks.report import machine
+from sb3_flowpolicy.common.machine import machine
 from sb3_flowpolicy.experiments import training
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.store import ItemFiles

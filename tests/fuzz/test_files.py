@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from sb3_flowpolicy.demonstrations import KEYS, load_demonstrations
+from sb3_flowpolicy.algorithms.demonstrations import KEYS, load_demonstrations
 from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, read_json
 from tests.bundle.mutations import by_chance
 from tests.fuzz.effort import fuzz

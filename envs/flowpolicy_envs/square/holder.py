@@ -11,7 +11,7 @@ class Holder:
     """Presses all four fingers inwards, by the same amount, whatever it observes.
 
     Called with an observation it returns an action, as `record_demonstrations` of
-    `sb3_flowpolicy.demonstrations` wants it; the observation may be a batch.
+    `sb3_flowpolicy.algorithms.demonstrations` wants it; the observation may be a batch.
 
     Args:
         push: How far inwards the targets are, as a share of the reach, in [0, 1].

@@ -9,11 +9,10 @@ from sb3_contrib.crossq.policies import CrossQPolicy
 from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
+from sb3_flowpolicy.algorithms.guarded import Guarded
 from sb3_flowpolicy.checkpoint import Resumable
-from sb3_flowpolicy.exploration import ColoredExploration
-from sb3_flowpolicy.guarded import Guarded
-from sb3_flowpolicy.policies import contrib as policies
-from sb3_flowpolicy.settings import (
+from sb3_flowpolicy.common.settings import (
     SETTINGS,
     assertions_as_value_errors,
     by_name,
@@ -23,6 +22,7 @@ from sb3_flowpolicy.settings import (
     integer,
     number,
 )
+from sb3_flowpolicy.policies import contrib as policies
 
 _POLICY_BASES = {TQC: TQCPolicy, CrossQ: CrossQPolicy}
 
@@ -57,7 +57,7 @@ class TQCFlow(_Checked, TQC):
 
     Everything of sb3-contrib's :class:`~sb3_contrib.TQC` holds. Besides, ``action_noise_color`` and
     ``action_noise_correlation_time`` make exploration directed, see
-    :class:`~sb3_flowpolicy.exploration.ColoredExploration`, and :meth:`learn` takes
+    :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`, and :meth:`learn` takes
     ``checkpoint_every`` and ``checkpoint_path``. Updates are sb3-contrib's own: the fast engine is
     :class:`~sb3_flowpolicy.SACFlow`'s alone.
 

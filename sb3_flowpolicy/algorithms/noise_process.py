@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 import torch as th
 
-MAX_COLOR = 1.5
+from sb3_flowpolicy.common.settings import MAX_COLOR
+
 DEFAULT_HORIZON = 1000
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 
-from sb3_flowpolicy.finite import NonFiniteError, all_finite
-from sb3_flowpolicy.policies import on_policy as policies
-from sb3_flowpolicy.settings import (
+from sb3_flowpolicy.common.settings import (
     PPO_SETTINGS,
     assertions_as_value_errors,
     by_name,
     check_policy,
     check_settings,
 )
+from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
+from sb3_flowpolicy.policies import on_policy as policies
 
 _COLORED = ("action_noise_color", "action_noise_correlation_time")
 

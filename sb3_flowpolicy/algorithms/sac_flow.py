@@ -17,25 +17,25 @@ from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.bundle.shareable import Shareable
-from sb3_flowpolicy.checkpoint import Resumable
-from sb3_flowpolicy.demonstrations import (
+from sb3_flowpolicy.algorithms.demonstrations import (
     fill_replay_buffer,
     follow_recipe,
     is_recipe,
     load_demonstrations,
 )
-from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
-from sb3_flowpolicy.engine.subnormals import flushed_subnormals
-from sb3_flowpolicy.exploration import ColoredExploration
-from sb3_flowpolicy.guarded import Guarded
-from sb3_flowpolicy.policies.off_policy import DistributionPolicy
-from sb3_flowpolicy.settings import (
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
+from sb3_flowpolicy.algorithms.guarded import Guarded
+from sb3_flowpolicy.bundle.shareable import Shareable
+from sb3_flowpolicy.checkpoint import Resumable
+from sb3_flowpolicy.common.settings import (
     assertions_as_value_errors,
     by_name,
     check_policy,
     check_settings,
 )
+from sb3_flowpolicy.engine import LOSSES, Engine, settings_key, why_unsupported
+from sb3_flowpolicy.engine.subnormals import flushed_subnormals
+from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
@@ -62,7 +62,7 @@ class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
         demonstrations: Transitions to put into the replay buffer before learning, as an
             ``.npz`` file or as arrays; see :meth:`add_demonstrations`. Or how to record them,
             ``{"controller": "flowpolicy_envs.Holder", "n_steps": 4000}``; see
-            :func:`~sb3_flowpolicy.demonstrations.follow_recipe`.
+            :func:`~sb3_flowpolicy.algorithms.demonstrations.follow_recipe`.
         critic_loss_coef: Factor of the critics' summed mean squared error, above 0: 0.5 as in
             SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels but for
             weight decay, which weighs half as much at 1.0.
@@ -74,7 +74,8 @@ class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
             ones. Parameters, optimiser states and replay stay float32; products keep 8 bits.
         action_noise_color: Exponent of the spectrum of the noise to explore with, in [0, 1.5]: 0 is
             white, 1 pink. Successive actions then lean the same way, while at a fixed state they
-            are distributed as ever; see :class:`~sb3_flowpolicy.exploration.ColoredExploration`.
+            are distributed as ever; see
+            :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`.
         action_noise_correlation_time: Instead of a colour, the correlation time of an
             Ornstein-Uhlenbeck process in steps, above 0.
         **sac_kwargs: Keyword arguments of SB3's SAC.
@@ -163,8 +164,8 @@ class SACFlow(Guarded, Resumable, Shareable, ColoredExploration, SAC):
         Args:
             demonstrations: Path of an ``.npz`` file, or a mapping, with the arrays
                 ``observations``, ``actions`` (in the environment's units), ``rewards``,
-                ``next_observations``, ``terminations`` and ``truncations``, one row per step,
-                as :func:`~sb3_flowpolicy.demonstrations.record_demonstrations` makes them.
+                ``next_observations``, ``terminations`` and ``truncations``, one row per step, as
+                :func:`~sb3_flowpolicy.algorithms.demonstrations.record_demonstrations` returns.
 
         Returns:
             Number of transitions that were added.

@@ -16,7 +16,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flowpolicy.finite import all_finite
+from sb3_flowpolicy.guard.finite import all_finite
 
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow, SeedBatch
-from sb3_flowpolicy.demonstrations import record_demonstrations
+from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
 
 FAST: dict[str, Any] = {
     "learning_starts": 30,

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch as th
 
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_setup import EnvFactory, make_env
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.seeds.setup import EnvFactory, make_env
 
 _BATCH_FILE = "batch.pt"
 

@@ -89,8 +89,8 @@ def check_experience(columns: Mapping[str, Any], step: int, who: Callable[[int],
         >>> check_experience(columns, 7, ENVIRONMENT)
         Traceback (most recent call last):
         ...
-        sb3_flowpolicy.finite.NonFiniteError: rewards must be finite in float32, got nan from \
-environment 1 at step 7; nothing of this step was stored
+        sb3_flowpolicy.guard.finite.NonFiniteError: rewards must be finite in float32, got nan \
+from environment 1 at step 7; nothing of this step was stored
     """
     for column, value in columns.items():
         if isinstance(value, np.ndarray) and all_finite(value):

@@ -10,8 +10,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_flowpolicy.engine import LOSSES
-from sb3_flowpolicy.finite import ENVIRONMENT, NonFiniteError, check_experience, check_step
-from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.guard.finite import ENVIRONMENT, NonFiniteError, check_experience, check_step
+from sb3_flowpolicy.guard.training_guard import TrainingGuard
 
 # The critics first: means over several updates do not tell which loss was the first.
 _NAMES = sorted(LOSSES, key="critic_loss".__ne__)
@@ -21,7 +21,7 @@ class Guarded(OffPolicyAlgorithm):
     """Mixin for SAC and its kin, to be named before them and before ``Resumable``.
 
     What environments hand out is looked at before it is stored, and losses, weights and optimisers
-    by a :class:`~sb3_flowpolicy.guard.TrainingGuard`.
+    by a :class:`~sb3_flowpolicy.guard.training_guard.TrainingGuard`.
 
     Args:
         *args: Arguments of the algorithm.
@@ -34,7 +34,7 @@ class Guarded(OffPolicyAlgorithm):
         >>> model.learn(20)
         Traceback (most recent call last):
         ...
-        sb3_flowpolicy.finite.NonFiniteError: critic.qf0.0.bias must be finite, got inf ...
+        sb3_flowpolicy.guard.finite.NonFiniteError: critic.qf0.0.bias must be finite, got inf ...
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:

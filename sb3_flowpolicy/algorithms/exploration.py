@@ -11,10 +11,10 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flowpolicy.noise_process import NoiseProcess, check_color
+from sb3_flowpolicy.algorithms.noise_process import NoiseProcess, check_color
+from sb3_flowpolicy.common.vec_env import BatchedVecEnv
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.policies.off_policy import check_finite_actions
-from sb3_flowpolicy.vec_env import BatchedVecEnv
 
 
 class ColoredExploration(OffPolicyAlgorithm):

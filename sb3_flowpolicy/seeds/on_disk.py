@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.segments import Ring
 from sb3_flowpolicy.checkpoint.session import (
     Checkpoints,
@@ -19,13 +21,11 @@ from sb3_flowpolicy.checkpoint.session import (
     take_up,
 )
 from sb3_flowpolicy.checkpoint.state import Run
-from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
-from sb3_flowpolicy.guard import TrainingGuard
-from sb3_flowpolicy.noise_process import NoiseProcess
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_checkpoint import read_batch, write_batch
-from sb3_flowpolicy.seed_episodes import SeedEpisodes
-from sb3_flowpolicy.seed_setup import EnvFactory, make_env
+from sb3_flowpolicy.guard.training_guard import TrainingGuard
+from sb3_flowpolicy.seeds.checkpoint import read_batch, write_batch
+from sb3_flowpolicy.seeds.episodes import SeedEpisodes
+from sb3_flowpolicy.seeds.setup import EnvFactory, make_env
+from sb3_flowpolicy.seeds.storage import SeedNoise, SeedStorage
 
 SelfBatch = TypeVar("SelfBatch", bound="BatchOnDisk")
 

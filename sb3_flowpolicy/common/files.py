@@ -1,31 +1,56 @@
-"""JSON files that are whole or not there, and that hold what a reader takes for granted."""
+"""Files that are written completely or not at all, and checked when they are read."""
 
 from __future__ import annotations
 
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a file at once or not at all."""
-    write_text(path, json.dumps(content, indent=1) + "\n")
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Write a file completely or not at all: an interruption leaves what was there before.
+
+    Args:
+        path: The file; its folder exists.
+
+    Yields:
+        Path of a temporary file with the same suffix in the same folder, which replaces the file
+        when the block ends without an exception.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with replacing(folder / "numbers.txt") as draft:
+        ...     _ = draft.write_text("1 2 3")
+        >>> [file.name for file in folder.iterdir()]
+        ['numbers.txt']
+    """
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    draft = Path(name)
+    try:
+        yield draft
+        os.chmod(draft, 0o644)  # mkstemp's files are readable by their owner only
+        os.replace(draft, path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file at once or not at all."""
-    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)  # mkstemp's files are for their owner alone
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    """Write a text file completely or not at all."""
+    with replacing(path) as draft:
+        draft.write_text(text)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file completely or not at all."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def read_json(path: Path, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_flowpolicy.finite import NonFiniteError
+from sb3_flowpolicy.guard.finite import NonFiniteError
 
 # Losses tell of most mischief at once. An infinity that a relu or a clamp hides from them is found
 # at the next look at everything, which takes about as long as one update of small networks.
@@ -46,7 +46,7 @@ class TrainingGuard:
         >>> TrainingGuard([model]).look()
         Traceback (most recent call last):
         ...
-        sb3_flowpolicy.finite.NonFiniteError: actor.latent_pi.0.bias must be finite, got inf ...
+        sb3_flowpolicy.guard.finite.NonFiniteError: actor.latent_pi.0.bias must be finite, got ...
     """
 
     def __init__(

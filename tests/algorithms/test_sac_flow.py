@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import configure
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow, sac_flow
-from sb3_flowpolicy.demonstrations import load_demonstrations, record_demonstrations
+from sb3_flowpolicy.algorithms.demonstrations import load_demonstrations, record_demonstrations
 from sb3_flowpolicy.engine import Engine
 
 FAST: dict[str, Any] = {

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.type_aliases import TrainFreq
 
-from sb3_flowpolicy.noise_process import MAX_COLOR
-
 #: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
+
+MAX_COLOR = 1.5
+"""Largest exponent of the spectrum of exploration noise."""
 
 # What a JSON number holds without rounding.
 _ANY = 2**53

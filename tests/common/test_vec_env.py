@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.vec_env import BatchedVecEnv, make_batched_env
+from sb3_flowpolicy.common.vec_env import BatchedVecEnv, make_batched_env
 
 
 @pytest.mark.parametrize(

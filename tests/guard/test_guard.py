@@ -15,8 +15,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_flowpolicy import NonFiniteError, SACFlow, SeedBatch
-from sb3_flowpolicy.finite import all_finite
-from sb3_flowpolicy.guard import TrainingGuard
+from sb3_flowpolicy.guard.finite import all_finite
+from sb3_flowpolicy.guard.training_guard import TrainingGuard
 
 FAST: dict[str, Any] = {
     "learning_starts": 10,
@@ -280,7 +280,7 @@ def test_parameters_are_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(
         TrainingGuard, "look", lambda guard: looks.append(guard.models[0]._n_updates) or look(guard)
     )
-    monkeypatch.setattr("sb3_flowpolicy.guard.UPDATES_BETWEEN_LOOKS", 20)
+    monkeypatch.setattr("sb3_flowpolicy.guard.training_guard.UPDATES_BETWEEN_LOOKS", 20)
     trained()
     assert looks == [0, 20, 40, 50]  # and at the end
 

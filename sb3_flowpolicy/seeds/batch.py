@@ -14,21 +14,20 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.session import (
     between_rollouts,
     finishing,
     start_checkpoints,
 )
 from sb3_flowpolicy.engine import LOSSES, Engine, settings_key
-from sb3_flowpolicy.engine.seed_storage import SeedNoise, SeedStorage
-from sb3_flowpolicy.finite import check_experience
-from sb3_flowpolicy.guard import TrainingGuard
-from sb3_flowpolicy.noise_process import NoiseProcess
+from sb3_flowpolicy.guard.finite import check_experience
+from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.policies import FlowActor
-from sb3_flowpolicy.sac_flow import SACFlow
-from sb3_flowpolicy.seed_episodes import SeedEpisodes
-from sb3_flowpolicy.seed_on_disk import BatchOnDisk
-from sb3_flowpolicy.seed_setup import (
+from sb3_flowpolicy.seeds.episodes import SeedEpisodes
+from sb3_flowpolicy.seeds.on_disk import BatchOnDisk
+from sb3_flowpolicy.seeds.setup import (
     CallbackFactory,
     EnvFactory,
     check_seeds,
@@ -38,6 +37,7 @@ from sb3_flowpolicy.seed_setup import (
     make_progress_bar,
     make_vec_env,
 )
+from sb3_flowpolicy.seeds.storage import SeedNoise, SeedStorage
 
 # What agents must agree on, besides the constants of their updates.
 _COMMON = (
@@ -178,7 +178,7 @@ class SeedBatch(BatchOnDisk):
 
         Raises:
             NonFiniteError: If an environment hands out, or training arrives at, NaN or infinity;
-                see :class:`~sb3_flowpolicy.guard.TrainingGuard`.
+                see :class:`~sb3_flowpolicy.guard.training_guard.TrainingGuard`.
         """
         with finishing(self):
             start_checkpoints(self, checkpoint_path, checkpoint_every)

@@ -1,4 +1,4 @@
-"""`python -m sb3_flowpolicy.train_seeds`: many seeds at once, from the zoo's hyperparameters."""
+"""`python -m sb3_flowpolicy.seeds`: many seeds at once, from the zoo's hyperparameters."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.hyperparameters import load_hyperparameters
-from sb3_flowpolicy.seed_batch import SeedBatch
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.seeds.batch import SeedBatch
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -122,7 +122,7 @@ def _report(batch: SeedBatch, env_id: str, n_episodes: int) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m sb3_flowpolicy.train_seeds",
+        prog="python -m sb3_flowpolicy.seeds",
         description="Train several seeds of an agent at once, for little more than the price of "
         "one, with the hyperparameters that rl_zoo3 would use.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,

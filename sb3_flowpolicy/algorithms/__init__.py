@@ -1,0 +1,1 @@
+"""The algorithms: SACFlow, TQCFlow, CrossQFlow, PPOFlow, and what they explore with."""

@@ -1,0 +1,1 @@
+"""Shared by several packages: argument checks, files, vectorized environments."""
