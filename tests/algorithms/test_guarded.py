@@ -9,7 +9,7 @@ import pytest
 import torch as th
 
 from sb3_flowpolicy import CrossQFlow, NonFiniteError, PPOFlow, TQCFlow
-from tests.test_guard import SEEDED, Faulty, size
+from tests.guard.test_guard import SEEDED, Faulty, size
 
 
 def weights_are_finite(model: Any) -> bool:

@@ -16,7 +16,8 @@ from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
 from stable_baselines3.common.logger import configure
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy import SACFlow, sac_flow
+from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy.algorithms import sac_flow
 from sb3_flowpolicy.algorithms.demonstrations import load_demonstrations, record_demonstrations
 from sb3_flowpolicy.engine import Engine
 

@@ -326,7 +326,7 @@ def test_finite_means_as_float32(values: np.ndarray, finite: bool) -> None:
 
 
 def test_demonstrations_must_fit_into_float32() -> None:
-    from tests.test_sac_flow import demos
+    from tests.algorithms.test_sac_flow import demos
 
     rows = {**demos(), "rewards": np.full(40, 1e300)}
     with pytest.raises(ValueError, match=r"demonstrations must be finite, .* in rewards"):
