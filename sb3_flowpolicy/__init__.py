@@ -9,9 +9,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_flowpolicy.algorithms.contrib import CrossQFlow, TQCFlow
+    from sb3_flowpolicy.algorithms.crossq_flow import CrossQFlow
     from sb3_flowpolicy.algorithms.ppo_flow import PPOFlow
     from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+    from sb3_flowpolicy.algorithms.tqc_flow import TQCFlow
     from sb3_flowpolicy.bundle import BundleError
     from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
     from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
@@ -104,7 +105,7 @@ _ELSEWHERE = {
     "CnnGaussTQCPolicy": "policies.contrib",
     "CnnLowRankActorCriticPolicy": "policies.on_policy",
     "CnnLowRankTQCPolicy": "policies.contrib",
-    "CrossQFlow": "algorithms.contrib",
+    "CrossQFlow": "algorithms.crossq_flow",
     "FlowActorCriticPolicy": "policies.on_policy",
     "FlowCrossQPolicy": "policies.contrib",
     "FlowTQCPolicy": "policies.contrib",
@@ -123,7 +124,7 @@ _ELSEWHERE = {
     "RunCheckpointCallback": "checkpoint",
     "SACFlow": "algorithms.sac_flow",
     "SeedBatch": "seeds.batch",
-    "TQCFlow": "algorithms.contrib",
+    "TQCFlow": "algorithms.tqc_flow",
     "export_onnx": "export",
     "has_checkpoint": "checkpoint",
     "register_distribution": "distributions",

@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.common.settings import MAX_COLOR
-
+MAX_COLOR = 1.5
+"""Largest exponent of the spectrum."""
 DEFAULT_HORIZON = 1000
 
 

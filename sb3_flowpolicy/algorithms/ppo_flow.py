@@ -2,41 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 
-from sb3_flowpolicy.common.settings import (
-    PPO_SETTINGS,
-    assertions_as_value_errors,
+from sb3_flowpolicy.common.validation import (
+    Check,
     by_name,
     check_policy,
     check_settings,
+    flag,
+    integer,
+    number,
+    optional,
+    or_infinity,
+    or_schedule,
 )
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy as policies
 
-_COLORED = ("action_noise_color", "action_noise_correlation_time")
+_SETTINGS: dict[str, Check] = {
+    "n_steps": integer(1),
+    "batch_size": integer(1),
+    "n_epochs": integer(1),
+    "gamma": number(0, 1),
+    "gae_lambda": number(0, 1),
+    "clip_range": or_schedule(number(0, above=True)),
+    "clip_range_vf": optional(or_schedule(number(0, above=True))),
+    "normalize_advantage": flag,
+    "ent_coef": number(0),
+    "vf_coef": number(0),
+    "max_grad_norm": or_infinity(number(0, above=True)),
+    "target_kl": optional(number(0, above=True)),
+    "stats_window_size": integer(1),
+    "seed": optional(integer(0, 2**32 - 1)),
+}
 
 
 class PPOFlow(PPO):
     """Proximal Policy Optimization with action distributions that correlate and bend.
 
-    SB3's :class:`~stable_baselines3.PPO` itself, which knows more policies by name.
+    SB3's :class:`~stable_baselines3.PPO`, which knows more policies by name.
 
     Args:
         policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, their ``Cnn...`` and
             ``MultiInput...`` forms, or a policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of PPO, in its order.
-        **kwargs: Keyword arguments of PPO.
+        **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that
+            successive actions are independent.
 
     Raises:
-        ValueError: If an argument is out of range, or coloured noise is asked for: PPO's ratios
-            take actions to be independent.
+        ValueError: If an argument is out of range.
 
     References:
         Proximal Policy Optimization Algorithms (Schulman et al., 2017).
@@ -59,22 +78,16 @@ class PPOFlow(PPO):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         given = by_name(PPO, args, kwargs)
-        _refuse_colored_noise(given)
-        check_settings(given, PPO_SETTINGS)
+        check_settings(given, _SETTINGS)
         check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
-        with assertions_as_value_errors():
-            super().__init__(*args, **kwargs)
-
-    def _setup_model(self) -> None:
-        _refuse_colored_noise(vars(self))  # what load() was given
-        super()._setup_model()
+        super().__init__(*args, **kwargs)
 
     def train(self) -> None:
         """Do PPO's updates.
 
         Raises:
-            NonFiniteError: If a reward, or a value, of the rollout is not finite; nothing is
-                learned from it.
+            NonFiniteError: If a reward or a value of the rollout is not finite; nothing is learned
+                from that rollout.
         """
         for name in ("rewards", "values"):
             found = getattr(self.rollout_buffer, name)
@@ -88,12 +101,3 @@ class PPOFlow(PPO):
                     self.num_timesteps,
                 )
         super().train()
-
-
-def _refuse_colored_noise(settings: Mapping[str, Any]) -> None:
-    colored = {name: settings[name] for name in _COLORED if name in settings}
-    if colored:
-        raise ValueError(
-            "action_noise_color and action_noise_correlation_time must be left to off-policy "
-            f"algorithms: PPO takes successive actions to be independent, got {colored}"
-        )

@@ -17,7 +17,7 @@ import numpy as np
 import torch as th
 
 import flowpolicy_envs
-from sb3_flowpolicy.algorithms import guarded
+from sb3_flowpolicy.algorithms import off_policy
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
 from sb3_flowpolicy.benchmarks.updates import Unmoved
@@ -93,7 +93,7 @@ class _Turns:
     def unwatched(self) -> float:
         self.models._guard = _Blind()
         with (
-            mock.patch("sb3_flowpolicy.algorithms.guarded.check_step", _accept),
+            mock.patch("sb3_flowpolicy.algorithms.off_policy.check_step", _accept),
             mock.patch("sb3_flowpolicy.seeds.batch.check_experience", _accept),
         ):
             return self._learn()
@@ -168,7 +168,7 @@ def _time_calls(turns: _Turns) -> dict[str, list[float]]:
         return mock.patch.object(owner, name, call)
 
     with (
-        timed(guarded, "check_step"),
+        timed(off_policy, "check_step"),
         timed(seed_batch, "check_experience"),
         timed(TrainingGuard, "before_updates"),
         timed(TrainingGuard, "after_updates"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,7 +39,7 @@ from sb3_flowpolicy.bundle.policy_spec import (
 from sb3_flowpolicy.bundle.replay_spec import buffer_from_spec, buffer_to_spec
 from sb3_flowpolicy.bundle.schedules import rate_from_spec, rate_to_spec
 from sb3_flowpolicy.bundle.space_specs import space_from_spec, space_to_spec
-from sb3_flowpolicy.common.settings import SETTINGS, Check, integer, number
+from sb3_flowpolicy.common.validation import Check, integer, number
 from sb3_flowpolicy.policies import DistributionPolicy
 
 SUFFIX = ".safetensors"
@@ -105,7 +106,10 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
         "policy_kwargs": kwargs_to_spec(policy.up_to_date(model.policy_kwargs)),
         "settings": {
             "learning_rate": rate_to_spec("learning_rate", model.learning_rate),
-            **{name: check(name, _attribute(model, name)) for name, check in SETTINGS.items()},
+            **{
+                name: check(name, _attribute(model, name))
+                for name, check in model.settings.items()  # type: ignore[attr-defined]
+            },
         },
         "replay_buffer": buffer_to_spec(model),
         "progress": {name: check(name, getattr(model, name)) for name, check in _PROGRESS.items()},
@@ -126,7 +130,7 @@ def load_bundle(
     device = get_device(device)
     config, arrays = read_container(path)
     try:
-        parts = _parse(config, arrays)
+        parts = _parse(config, arrays, cls.settings)  # type: ignore[attr-defined]
     except (ValueError, MemoryError) as error:
         raise BundleError(f"{path} must hold a model of {cls.__name__}: {error}") from error
     if env is not None:
@@ -139,13 +143,13 @@ def load_bundle(
         raise BundleError(f"{path} must hold a model of {cls.__name__}: {text}") from error
 
 
-def _parse(config: Any, arrays: Arrays) -> dict[str, Any]:
+def _parse(config: Any, arrays: Arrays, settings: Mapping[str, Check]) -> dict[str, Any]:
     """Turn a configuration into checked attributes; takes what it uses out of ``arrays``."""
     if not isinstance(config, dict) or config.get("format") != FORMAT:
         got = config.get("format") if isinstance(config, dict) else type(config).__name__
         raise ValueError(f"format must be {FORMAT}, got {str(got)[:80]}: is it of a later version?")
     _expect_keys("the settings", config, _KEYS)
-    _expect_keys("settings", config["settings"], {"learning_rate", *SETTINGS})
+    _expect_keys("settings", config["settings"], {"learning_rate", *settings})
     _expect_keys("progress", config["progress"], set(_PROGRESS))
     _expect_keys("made_with", config["made_with"], set(_made_with()))
     if not all(isinstance(version, str) for version in config["made_with"].values()):
@@ -162,7 +166,7 @@ def _parse(config: Any, arrays: Arrays) -> dict[str, Any]:
         "policy_kwargs": kwargs_from_spec(config["policy_kwargs"]),
         "learning_rate": rate_from_spec("learning_rate", config["settings"]["learning_rate"]),
     }
-    for name, check in SETTINGS.items():
+    for name, check in settings.items():
         value = config["settings"][name]
         if name == "train_freq":
             # A plain number would mean steps, but is not what is saved.

@@ -14,7 +14,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_flowpolicy.bundle.container import Arrays
-from sb3_flowpolicy.common.settings import Check, flag, number
+from sb3_flowpolicy.common.validation import Check, flag, number
 
 _above_zero = number(0, above=True)
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 
 from sb3_flowpolicy.bundle.container import Arrays
-from sb3_flowpolicy.common.settings import Check, flag, number
+from sb3_flowpolicy.common.validation import Check, flag, number
 
 
 def _betas(name: str, value: Any) -> list[float]:

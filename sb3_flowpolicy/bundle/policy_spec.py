@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.common.settings import Check, flag, integer, number, one_of, optional
+from sb3_flowpolicy.common.validation import Check, flag, integer, number, one_of, optional
 from sb3_flowpolicy.policies import DistributionPolicy
 from sb3_flowpolicy.policies.deterministic import MODES as DETERMINISTIC_MODES
 

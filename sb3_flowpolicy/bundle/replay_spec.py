@@ -12,7 +12,7 @@ from stable_baselines3.her.goal_selection_strategy import (
     GoalSelectionStrategy,
 )
 
-from sb3_flowpolicy.common.settings import Check, flag, integer, number
+from sb3_flowpolicy.common.validation import Check, flag, integer, number
 
 _CLASSES: dict[str, type[ReplayBuffer]] = {
     one.__name__: one

@@ -6,7 +6,7 @@ from typing import Any
 
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_flowpolicy.common.settings import is_number, number
+from sb3_flowpolicy.common.validation import is_number, number
 
 _rate = number(0)
 _CHECKS = {"start": _rate, "end": _rate, "end_fraction": number(0, 1, above=True)}

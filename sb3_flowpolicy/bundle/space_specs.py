@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_flowpolicy.bundle.container import Arrays
-from sb3_flowpolicy.common.settings import integer
+from sb3_flowpolicy.common.validation import integer
 
 # No robot has as many; and no product of two of them leaves an int64.
 _MOST = 2**31 - 1

@@ -1,7 +1,7 @@
-"""Runs that go on exactly where they stopped: checkpoints that hold everything."""
+"""Checkpoints that hold everything, so that a resumed run equals one that was not interrupted."""
 
 from sb3_flowpolicy.checkpoint.callback import RunCheckpointCallback
-from sb3_flowpolicy.checkpoint.resumable import Resumable
+from sb3_flowpolicy.checkpoint.session import RunCheckpoints
 from sb3_flowpolicy.checkpoint.store import has_checkpoint
 
-__all__ = ["Resumable", "RunCheckpointCallback", "has_checkpoint"]
+__all__ = ["RunCheckpointCallback", "RunCheckpoints", "has_checkpoint"]

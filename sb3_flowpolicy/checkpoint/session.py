@@ -1,12 +1,11 @@
-"""Writing checkpoints while a run goes on, and taking one up again."""
+"""Writing checkpoints while a run goes on, and resuming one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import stable_baselines3
 import torch as th
@@ -23,48 +22,129 @@ from sb3_flowpolicy.checkpoint.store import Checkpoint, CheckpointStore
 _STATE = "state.pt"
 
 
-class Checkpoints:
-    """Writes checkpoints of a run between its rollouts, where the next thing is a new step.
+class RunCheckpoints:
+    """The checkpoints of one learner: an algorithm, or several in lockstep.
+
+    Checkpoints are written, and resumed from, between rollouts: at that moment the state of a run
+    is in objects, none of it in local variables.
 
     Args:
-        run: The run.
-        path: Folder for its checkpoints.
-        resumption: What the run was resumed from, if it was.
-
-    Raises:
-        ValueError: If the folder holds another run's checkpoints.
+        describe: Returns what a checkpoint consists of.
     """
 
-    def __init__(self, run: Run, path: str | Path, resumption: Resumption | None = None) -> None:
-        self.run = run
-        self.path = Path(path)
-        self.every = 1
-        self.signals = StopSignals()
+    def __init__(self, describe: Callable[[], Run]) -> None:
+        self._describe = describe
+        #: Folder of the checkpoints, None before any were asked for.
+        self.path: Path | None = None
+        #: Whether checkpoints are being written.
         self.active = False
+        self._every = 1
         self._last: int | None = None
-        if resumption is not None and resumption.store.path.resolve() == self.path.resolve():
-            self._store, self._rows = resumption.store, resumption.rows
-            self._last = run.first.num_timesteps
-            return
-        self._store, self._rows = CheckpointStore(path), RowFiles()
-        if self._store.folders():
-            raise ValueError(
-                f"checkpoint_path must be an empty folder for a new run, got {path}, which holds "
-                f"{self._store.folders()[-1].name}: resume that run, or choose another folder"
-            )
+        self._store: CheckpointStore | None = None
+        self._rows = RowFiles()
+        self._signals = StopSignals()
+        # Of a run that was resumed, until it learns again: the state to restore once learning has
+        # begun, and the step at which the interrupted call of ``learn`` began.
+        self._late: bytes | None = None
+        self._begun = 0
+        self._resumed_from: CheckpointStore | None = None
+        #: Environments whose state could not be saved: they begin new episodes when resumed.
+        self.opaque: set[str] = set()
 
-    def start(self, checkpoint_every: int) -> None:
-        """Begin; a new run's first checkpoint is due at once: if it fails, then not later.
+    @property
+    def resuming(self) -> bool:
+        """Whether a checkpoint was loaded and the run has not continued yet."""
+        return self._late is not None
+
+    @contextmanager
+    def learning(self, path: str | Path | None, every: int | None) -> Iterator[None]:
+        """Write checkpoints during a call of ``learn``, and a last one at its end.
+
+        SIGTERM and Ctrl-C write a checkpoint, then take effect.
 
         Args:
-            checkpoint_every: Environment steps between two checkpoints, at least 1.
+            path: Folder for them.
+            every: Environment steps between two of them. With both None, none are written.
+
+        Raises:
+            ValueError: If ``every`` is below 1 or only one of the two is given, or the folder holds
+                another run's checkpoints.
         """
-        self.every = check_every(checkpoint_every)
-        self.active = True
-        self.signals.watch()
+        if (path is None) != (every is None):
+            raise ValueError(
+                f"checkpoint_every and checkpoint_path go together, got {every} and {path}"
+            )
+        try:
+            if path is not None and every is not None:
+                self.start(path, every)
+            yield
+            if self._late is not None:
+                # This call had ended before the run was interrupted, which its logs are to show;
+                # the next call is the one to resume.
+                self._begun = self._run().first._total_timesteps
+                state.restore_late(self._run(), self._late)
+            run = self._run()
+            reached = run.first.num_timesteps >= run.first._total_timesteps
+            # A callback that stops learning does so in the middle of a rollout, where resuming
+            # could not be exact.
+            if self.active and self._last is not None and reached:
+                self._write(run)
+        finally:
+            self.stop()
+        self._signals.deliver()
+
+    def start(self, path: str | Path, every: int) -> None:
+        """Begin to write checkpoints, until :meth:`stop`.
+
+        The first checkpoint of a new run is due at once, so that what cannot be saved shows early.
+
+        Raises:
+            ValueError: As :meth:`learning`.
+        """
+        check_every(every)
+        path = Path(path)
+        if self.path is None or self.path.resolve() != path.resolve():
+            if self.active:
+                raise ValueError(
+                    "checkpoint_path must be one folder for a call of learn(), got "
+                    f"{self.path} and {path}"
+                )
+            source = self._resumed_from
+            if source is not None and source.path.resolve() == path.resolve():
+                self._store = source
+                self._last = self._run().first.num_timesteps
+            else:
+                store = CheckpointStore(path)
+                if store.folders():
+                    raise ValueError(
+                        f"checkpoint_path must be an empty folder for a new run, got {path}, which "
+                        f"holds {store.folders()[-1].name}: resume that run, or choose another "
+                        "folder"
+                    )
+                self._store, self._rows, self._last = store, RowFiles(), None
+            self.path = path
+        self._every, self.active = every, True
+        self._signals.watch()
+
+    def stop(self) -> None:
+        """Stop writing checkpoints and watching signals."""
+        self.active = False
+        self._signals.release()
+
+    def remaining(self, total_timesteps: int, reset_num_timesteps: bool) -> tuple[int, bool]:
+        """Return the arguments with which an interrupted call of ``learn`` goes on to its end.
+
+        Args:
+            total_timesteps: Argument of the call.
+            reset_num_timesteps: Argument of the call.
+        """
+        if not self.resuming:
+            return total_timesteps, reset_num_timesteps
+        end = total_timesteps + (0 if reset_num_timesteps else self._begun)
+        return end - self._run().first.num_timesteps, False
 
     def between_rollouts(self, callbacks: Mapping[str, BaseCallback]) -> bool:
-        """Write a checkpoint if it is time.
+        """Restore what waits for this moment, and write a checkpoint if one is due.
 
         Args:
             callbacks: The callback of each agent's ``learn``.
@@ -72,160 +152,88 @@ class Checkpoints:
         Returns:
             Whether to go on: False after SIGTERM and Ctrl-C.
         """
-        self.run.callbacks = dict(callbacks)
-        now, stop = self.run.first.num_timesteps, self.signals.received is not None
+        if self._late is not None:
+            state.restore_late(self._run(callbacks), self._late)
+            self._late = None
+            self.opaque.clear()
+        if not self.active:
+            return True
+        run = self._run(callbacks)
+        now, stop = run.first.num_timesteps, self._signals.received is not None
         if self._last is not None and now < self._last:
             raise ValueError(
                 "reset_num_timesteps must be False for a second run in the same checkpoint_path, "
                 f"got a count of {now} where {self.path} is at {self._last}"
             )
-        if stop or self._last is None or now // self.every > self._last // self.every:
-            self.write()
+        if stop or self._last is None or now // self._every > self._last // self._every:
+            self._write(run)
         return not stop
 
-    def finish(self) -> None:
-        """Write the last checkpoint of a call of ``learn`` that has reached its end.
+    def load(self, store: CheckpointStore, checkpoint: Checkpoint) -> None:
+        """Restore a checkpoint's state in agents that have been loaded.
 
-        Where a callback stopped it, that was in the middle of a rollout: going on from there could
-        not be exact.
+        Raises:
+            ValueError: If environments are not built as they were.
         """
-        first = self.run.first
-        if self._last is not None and first.num_timesteps >= first._total_timesteps:
-            self.write()
-
-    def stop(self) -> None:
-        """Write no more, and watch no signals any more."""
-        self.active = False
-        self.signals.release()
-        self.run.callbacks = {}
-
-    def write(self) -> None:
-        """Write a checkpoint now, unless this step has one."""
-        now = self.run.first.num_timesteps
-        if now != self._last:
-            self._store.write(now, _facts(self.run), self._write_files)
-            self._last = now
-
-    def _write_files(self, folder: Path, new_rows: Path) -> dict[str, Any]:
-        run = self.run
-        for name, agent in run.agents.items():
-            agent.save(folder / f"{name}.zip")
-        th.save(state.collect(run), folder / _STATE)
+        run, manifest = self._run(), checkpoint.manifest
+        for name, env in run.environments.items():
+            check_same_build(env, manifest["layers"][name])
+        parts = th.load(checkpoint.folder / _STATE, weights_only=True)
+        state.restore_early(run, parts["early"])
+        self._rows = RowFiles()
         found = run.ring()
         if found is None:
             for name, agent in run.agents.items():
-                agent.save_replay_buffer(folder / f"{name}.buffer.pkl")
-            return {}
-        source, ring = found
-        steps = run.first.num_timesteps // run.first.n_envs
-        files = self._rows.update(source, ring, steps, new_rows)
-        facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
-        return {"segments": segments.to_json(files), **facts}
+                path = checkpoint.folder / f"{name}.buffer.pkl"
+                agent.load_replay_buffer(path, truncate_last_traj=False)
+        else:
+            source, ring = found
+            if manifest["capacity"] != ring.capacity:
+                raise ValueError(
+                    "buffer_size must be as when the checkpoint was written, "
+                    f"{manifest['capacity']} steps of each environment, got {ring.capacity}"
+                )
+            files = segments.from_json(manifest["segments"])
+            segments.fill(ring.columns, checkpoint.rows_folder, files)
+            source.pos, source.full = manifest["pos"], manifest["full"]
+            self._rows = RowFiles(source, files, run.first.num_timesteps // run.first.n_envs)
+        self._late, self._begun, self._resumed_from = parts["late"], manifest["begun"], store
 
+    def _run(self, callbacks: Mapping[str, BaseCallback] | None = None) -> Run:
+        run = self._describe()
+        run.callbacks, run.opaque = dict(callbacks or {}), self.opaque
+        return run
 
-@dataclass
-class Resumption:
-    """A run that was resumed, until it learns again.
+    def _write(self, run: Run) -> None:
+        """Write a checkpoint, unless this step has one."""
+        assert self._store is not None
+        now = run.first.num_timesteps
+        if now == self._last:
+            return
 
-    Args:
-        run: The run.
-        store: Where its checkpoints are.
-        rows: The files that hold its replay buffer.
-        late: State to put back once learning has begun.
-        begun: Environment steps at which the interrupted call of ``learn`` began.
-    """
+        def write_files(folder: Path, new_rows: Path) -> dict[str, Any]:
+            for name, agent in run.agents.items():
+                agent.save(folder / f"{name}.zip")
+            th.save(state.collect(run), folder / _STATE)
+            found = run.ring()
+            if found is None:
+                for name, agent in run.agents.items():
+                    agent.save_replay_buffer(folder / f"{name}.buffer.pkl")
+                return {}
+            source, ring = found
+            files = self._rows.update(source, ring, now // run.first.n_envs, new_rows)
+            facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
+            return {"segments": segments.to_json(files), **facts}
 
-    run: Run
-    store: CheckpointStore
-    rows: RowFiles
-    late: bytes
-    begun: int
-
-    def remaining(self, total_timesteps: int, reset_num_timesteps: bool) -> int:
-        """Return how many steps the interrupted call of ``learn``, made again, has to go."""
-        end = total_timesteps + (0 if reset_num_timesteps else self.begun)
-        return end - self.run.first.num_timesteps
-
-    def restore(self, callbacks: Mapping[str, BaseCallback]) -> None:
-        """Put the rest of the state back: the next thing is a new step."""
-        self.run.callbacks = dict(callbacks)
-        state.restore_late(self.run, self.late)
-
-
-class Resumes(Protocol):
-    """Whatever learns and can be resumed: an algorithm, or a batch of them."""
-
-    _checkpoints: Checkpoints | None
-    _resumption: Resumption | None
-
-    def _describe_run(self) -> Run: ...
-
-
-def start_checkpoints(owner: Resumes, path: str | Path | None, every: int | None) -> None:
-    """Write checkpoints from now on, until :func:`finishing` ends.
-
-    Args:
-        owner: What learns.
-        path: Folder for them.
-        every: Environment steps between two of them. With both None, nothing is done.
-
-    Raises:
-        ValueError: If ``every`` is below 1 or only one of the two is given, or the folder holds
-            another run's checkpoints.
-    """
-    if path is None and every is None:
-        return
-    if path is None or every is None:
-        raise ValueError(
-            f"checkpoint_every and checkpoint_path go together, got {every} and {path}"
-        )
-    if owner._checkpoints is None or owner._checkpoints.path.resolve() != Path(path).resolve():
-        check_every(every)
-        if owner._checkpoints is not None and owner._checkpoints.active:
-            raise ValueError(
-                "checkpoint_path must be one folder for a call of learn(), got "
-                f"{owner._checkpoints.path} and {path}"
-            )
-        owner._checkpoints = Checkpoints(owner._describe_run(), path, owner._resumption)
-    else:
-        owner._checkpoints.run = owner._describe_run()  # the environment may be another by now
-    owner._checkpoints.start(every)
-
-
-@contextmanager
-def finishing(owner: Resumes) -> Iterator[None]:
-    """End the checkpoints that are started inside with a last one, and obey SIGTERM and Ctrl-C."""
-    try:
-        yield
-        if owner._resumption is not None:
-            # This call had ended before, and its logs are to show it; the next was interrupted.
-            owner._resumption.begun = owner._resumption.run.first._total_timesteps
-            owner._resumption.restore({})
-        if owner._checkpoints is not None and owner._checkpoints.active:
-            owner._checkpoints.finish()
-    finally:
-        if owner._checkpoints is not None:
-            owner._checkpoints.stop()
-    if owner._checkpoints is not None:
-        owner._checkpoints.signals.deliver()
-
-
-def between_rollouts(owner: Resumes, callbacks: Mapping[str, BaseCallback]) -> bool:
-    """Put back what waits for this moment, write what is due, and return whether to go on."""
-    if owner._resumption is not None:
-        owner._resumption.restore(callbacks)
-        owner._resumption = None
-    checkpoints = owner._checkpoints
-    if checkpoints is None or not checkpoints.active:
-        return True
-    return checkpoints.between_rollouts(callbacks)
+        self._store.write(now, _facts(run), write_files)
+        self._last = now
 
 
 def open_checkpoint(path: str | Path, kind: str) -> tuple[CheckpointStore, Checkpoint]:
     """Find the newest undamaged checkpoint of a folder.
 
     Raises:
-        ValueError: If there is none, or something else must resume it than ``kind``.
+        ValueError: If there is none, or it belongs to another class than ``kind``.
     """
     store = CheckpointStore(path)
     checkpoint = store.newest()
@@ -242,7 +250,7 @@ def load_agent(
     env: Any,
     device: th.device | str = "auto",
 ) -> Any:
-    """Load an agent for a run that goes on.
+    """Load an agent of a checkpoint.
 
     Raises:
         ValueError: If the environment is not built as it was, or has other spaces.
@@ -253,37 +261,6 @@ def load_agent(
         return algorithm.load(path, env=env, device=device, force_reset=False)
     except ValueError as error:
         raise ValueError(f"env must be that of {checkpoint.folder}: {error}") from error
-
-
-def take_up(run: Run, store: CheckpointStore, checkpoint: Checkpoint) -> Resumption:
-    """Put a checkpoint's state into a run whose agents have been loaded.
-
-    Raises:
-        ValueError: If environments are not built as they were.
-    """
-    manifest = checkpoint.manifest
-    for name, env in run.environments.items():
-        check_same_build(env, manifest["layers"][name])
-    parts = th.load(checkpoint.folder / _STATE, weights_only=True)
-    state.restore_early(run, parts["early"])
-    rows = RowFiles()
-    found = run.ring()
-    if found is None:
-        for name, agent in run.agents.items():
-            path = checkpoint.folder / f"{name}.buffer.pkl"
-            agent.load_replay_buffer(path, truncate_last_traj=False)
-    else:
-        source, ring = found
-        if manifest["capacity"] != ring.capacity:
-            raise ValueError(
-                f"buffer_size must be as when the checkpoint was written, {manifest['capacity']} "
-                f"steps of each environment, got {ring.capacity}"
-            )
-        files = segments.from_json(manifest["segments"])
-        segments.fill(ring.columns, checkpoint.rows_folder, files)
-        source.pos, source.full = manifest["pos"], manifest["full"]
-        rows = RowFiles(source, files, run.first.num_timesteps // run.first.n_envs)
-    return Resumption(run, store, rows, parts["late"], manifest["begun"])
 
 
 def check_every(checkpoint_every: int) -> int:

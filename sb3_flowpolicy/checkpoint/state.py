@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_flowpolicy.checkpoint import environments, logs, pickling
 from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
 
-# What SB3's load leaves out or makes anew, and counters.
+# Attributes of SB3's that its load() leaves out or creates anew, and counters.
 _ATTRIBUTES = (
     "num_timesteps",
     "_n_updates",
@@ -32,9 +32,6 @@ _ATTRIBUTES = (
     "_last_original_obs",
     "_last_episode_starts",
     "_num_timesteps_at_start",
-    "_planned",
-    "_worth_compiling",
-    "_noise_process",
 )
 
 
@@ -125,7 +122,8 @@ def restore_early(run: Run, pickled: bytes) -> None:
     for name, env in run.environments.items():
         environments.set_layer_states(env, state["environments"][name])
         logs.write_texts(environments.monitor_files(env), state["monitors"][name])
-    run.opaque = set(state["opaque"])
+    run.opaque.clear()
+    run.opaque.update(state["opaque"])
     for name in run.opaque & set(run.agents):
         agent = run.agents[name]
         agent._last_obs = None

@@ -1,6 +1,7 @@
 """The SAC update as a pure function of tensors: eager, compiled, or stacked over seeds."""
 
 from sb3_flowpolicy.engine.engine import Engine, settings_key, why_unsupported
+from sb3_flowpolicy.engine.runtime import EngineRuntime
 from sb3_flowpolicy.engine.update import LOSSES
 
-__all__ = ["LOSSES", "Engine", "settings_key", "why_unsupported"]
+__all__ = ["LOSSES", "Engine", "EngineRuntime", "settings_key", "why_unsupported"]

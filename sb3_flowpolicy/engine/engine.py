@@ -1,4 +1,4 @@
-"""The engine: takes SAC models over, updates them, and hands them back."""
+"""The engine: binds SAC models to flat tensors, updates them, and releases them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
-from sb3_flowpolicy.engine.subnormals import flushed_subnormals
-from sb3_flowpolicy.engine.threads import threads_for
 from sb3_flowpolicy.engine.update import (
     Batch,
     Moments,
@@ -35,7 +33,7 @@ _MODE_DEPENDENT = (
 
 
 def why_unsupported(model: SAC) -> str | None:
-    """Say what about a model the engine cannot do; None if it can do everything."""
+    """Return what about a model the engine does not support; None if it supports everything."""
     policy = model.policy
     if not isinstance(policy.actor, FlowActor):
         return f"actor of type {type(policy.actor).__name__}"
@@ -68,7 +66,7 @@ def why_unsupported(model: SAC) -> str | None:
 
 
 def settings_key(model: SAC, critic_loss_coef: float) -> tuple[object, ...]:
-    """Everything that :func:`update_settings` depends on, quickly: asked before every update."""
+    """Return everything that :func:`update_settings` depends on; quick to compare."""
     groups = [model.actor.optimizer.param_groups[0], model.critic.optimizer.param_groups[0]]
     if model.ent_coef_optimizer is not None:
         groups.append(model.ent_coef_optimizer.param_groups[0])
@@ -78,7 +76,7 @@ def settings_key(model: SAC, critic_loss_coef: float) -> tuple[object, ...]:
 
 
 def update_settings(model: SAC, critic_loss_coef: float) -> UpdateSettings:
-    """Read the constants of an update off a model that the engine supports."""
+    """Return the constants of an update of a model that the engine supports."""
     actor_adam = adam_settings(model.policy.actor.optimizer)
     critic_adam = adam_settings(model.policy.critic.optimizer)
     assert actor_adam is not None
@@ -95,7 +93,7 @@ def update_settings(model: SAC, critic_loss_coef: float) -> UpdateSettings:
 
 
 class Engine:
-    """Updates S models in lockstep. Their modules and optimisers become views of its tensors.
+    """Updates S models in lockstep. Their modules and optimizers become views of its tensors.
 
     Args:
         models: S models that differ in nothing but weights, data and random numbers.
@@ -123,16 +121,17 @@ class Engine:
         self.critic_adam = FlatAdam(
             self.networks.critic, [model.policy.critic.optimizer for model in self.models]
         )
-        self.temperature: FlatParameters | None = None
+        self.log_ent_coef: FlatParameters | None = None
         self.ent_coef_adam: FlatAdam | None = None
         if first.ent_coef_optimizer is not None:
-            # Not a module's parameter, but owned by an optimiser all the same.
-            self.temperature = FlatParameters(
+            # Not a module's parameter, but owned by an optimizer all the same.
+            self.log_ent_coef = FlatParameters(
                 [{"log_ent_coef": [model.log_ent_coef]} for model in self.models]  # type: ignore[list-item]
             )
             optimizers = [model.ent_coef_optimizer for model in self.models]
-            self.ent_coef_adam = FlatAdam(self.temperature, optimizers)  # type: ignore[arg-type]
+            self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)  # type: ignore[arg-type]
         settings = update_settings(first, critic_loss_coef)
+        self.critic_loss_coef = critic_loss_coef
         self.settings_key = settings_key(first, critic_loss_coef)
         self._identities = [_identity(model) for model in self.models]
         self._slots = [slot for model in self.models for slot in _slots(model)]
@@ -155,12 +154,14 @@ class Engine:
         self._compiled_sample = Compiled(sample, "the policy", device)
 
     def _runs_compiled(self) -> bool:
-        """What could not be compiled once is not tried again, for the other function neither."""
+        """Whether to call compiled functions: not after one could not be compiled."""
         broken = self._compiled_update.broken or self._compiled_sample.broken
         return self.compiled and not broken
 
-    def belongs_to(self, models: Sequence[SAC]) -> bool:
-        """Whether these still are the models, down to their networks and optimisers."""
+    def fits(self, models: Sequence[SAC]) -> bool:
+        """Whether these still are the models, with the same networks, optimizers and constants."""
+        if self.settings_key != settings_key(models[0], self.critic_loss_coef):
+            return False
         for model, kept in zip(models, self._identities, strict=True):
             if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):
                 return False
@@ -172,18 +173,25 @@ class Engine:
     def _parts(self) -> list[FlatParameters | FlatAdam]:
         parts = [self.networks.actor, self.networks.critic, self.networks.target]
         return [
-            *(part for part in (*parts, self.temperature) if part is not None),
+            *(part for part in (*parts, self.log_ent_coef) if part is not None),
             self.actor_adam,
             self.critic_adam,
             *([self.ent_coef_adam] if self.ent_coef_adam is not None else []),
         ]
 
     def synchronize(self) -> bool:
-        """Take over what was loaded or moved since the last update; cheap if nothing was.
+        """Take over what was loaded or moved since the last update.
 
         Returns:
-            Whether there was anything.
+            Whether parameters or optimizer states were.
         """
+        # A fixed entropy coefficient may be replaced between two calls, or changed in place.
+        fixed = [(tensor, tensor._version) for tensor in self._fixed_ent_coefs()]
+        if len(fixed) != len(self._fixed) or any(
+            now is not then or version != before
+            for (now, version), (then, before) in zip(fixed, self._fixed, strict=True)
+        ):
+            self._state, self._fixed = None, fixed
         parts = self._parts()
         if all(part.is_bound() for part in parts):
             return False
@@ -193,7 +201,7 @@ class Engine:
         return True
 
     def release(self) -> None:
-        """Give modules and optimisers memory of their own, until the next update."""
+        """Give modules and optimizers memory of their own, until :meth:`synchronize`."""
         for part in self._parts():
             part.release()
 
@@ -212,24 +220,19 @@ class Engine:
         if noise is None:
             shape = (*obs.shape[:2], self.networks.noise_dim)
             noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
-        with threads_for(actor.numel() * obs.shape[1]), flushed_subnormals():
-            if self._runs_compiled():
-                return self._compiled_sample(obs.shape, actor, obs, noise)
-            return self._sample(actor, obs, noise)
+        if self._runs_compiled():
+            return self._compiled_sample(obs.shape, actor, obs, noise)
+        return self._sample(actor, obs, noise)
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""
-        fixed = [] if self.temperature else [model.ent_coef_tensor for model in self.models]
-        # A fixed temperature may be set anew between two calls, or changed in place.
-        known = [(tensor, tensor._version) for tensor in fixed]
-        same = len(known) == len(self._fixed) and all(
-            now is then and version == before
-            for (now, version), (then, before) in zip(known, self._fixed, strict=True)
-        )
-        if self._state is None or not same:
-            self._state, self._fixed = self._gather_state(fixed), known
+        if self._state is None:
+            self._state = self._gather_state()
             self._grouped = None
         return self._state
+
+    def _fixed_ent_coefs(self) -> list[th.Tensor]:
+        return [] if self.log_ent_coef else [model.ent_coef_tensor for model in self.models]
 
     def _groups(self, batch_size: int) -> list[tuple[slice, TrainState]]:
         """Return the seeds that are updated together, and their part of the state."""
@@ -241,19 +244,19 @@ class Engine:
             self._grouped = batch_size, groups
         return self._grouped[1]
 
-    def _gather_state(self, fixed: list[th.Tensor]) -> TrainState:
+    def _gather_state(self) -> TrainState:
         def moments(adam: FlatAdam) -> Moments:
             return Moments(adam.mean, adam.square, adam.step)
 
-        if self.temperature is not None:
-            temperature = self.temperature.data
+        if self.log_ent_coef is not None:
+            ent_coef = self.log_ent_coef.data
         else:
-            temperature = th.stack([tensor.reshape(1) for tensor in fixed])
+            ent_coef = th.stack([tensor.reshape(1) for tensor in self._fixed_ent_coefs()])
         return TrainState(
             self.networks.actor.data,
             self.networks.critic.data,
             self.networks.target.data,
-            temperature,
+            ent_coef,
             moments(self.actor_adam),
             moments(self.critic_adam),
             None if self.ent_coef_adam is None else moments(self.ent_coef_adam),
@@ -292,7 +295,7 @@ class Engine:
         """
         first = self.models[0]
         optimizers = [first.actor.optimizer, first.critic.optimizer]
-        # A fixed temperature takes no steps, at whatever rate.
+        # A fixed entropy coefficient takes no steps, at whatever rate.
         optimizers.append(first.ent_coef_optimizer or first.actor.optimizer)
         rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
         if self._learning_rates is None or self._learning_rates[0] != rates:
@@ -301,19 +304,17 @@ class Engine:
         learning_rates = self._learning_rates[1]
         groups = self._groups(batches[0].rewards.shape[1])
         history = self.history = []
-        state = groups[0][1]
-        n_parameters = state.actor.numel() + state.critic.numel()
-        with threads_for(n_parameters * batches[0].rewards.shape[1]), flushed_subnormals():
-            for k, batch in enumerate(batches, start):
-                move_target = k % first.target_update_interval == 0
-                if len(groups) == 1:
-                    history.append(self._update_once(state, batch, learning_rates, move_target))
-                    continue
-                losses = [
-                    self._update_once(part, batch.of(seeds), learning_rates, move_target)
-                    for seeds, part in groups
-                ]
-                history.append(th.cat(losses, dim=1))
+        for k, batch in enumerate(batches, start):
+            move_target = k % first.target_update_interval == 0
+            if len(groups) == 1:
+                state = groups[0][1]
+                history.append(self._update_once(state, batch, learning_rates, move_target))
+                continue
+            losses = [
+                self._update_once(part, batch.of(seeds), learning_rates, move_target)
+                for seeds, part in groups
+            ]
+            history.append(th.cat(losses, dim=1))
         return history[0] if len(history) == 1 else th.stack(history).mean(0)
 
     def _update_once(
@@ -326,7 +327,7 @@ class Engine:
 
 
 def _can_be_rows(model: SAC) -> bool:
-    """Whether minibatches can be read as rows; pixels would take four times the memory so."""
+    """Whether minibatches can be rows of floats; pixels would take four times the memory."""
     buffer = model.replay_buffer
     if buffer is None or not is_plain(buffer) or model.get_vec_normalize_env() is not None:
         return False
@@ -334,7 +335,7 @@ def _can_be_rows(model: SAC) -> bool:
 
 
 def _identity(model: SAC) -> tuple[object, ...]:
-    """What an engine holds on to: if one of these is replaced, it works on orphans."""
+    """Return the objects whose tensors an engine has bound."""
     return (
         model.policy,
         model.actor.optimizer,
@@ -345,7 +346,7 @@ def _identity(model: SAC) -> tuple[object, ...]:
 
 
 def _slots(model: SAC) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter, bool]]:
-    """Where the first parameter of each network lives, which it is, and whether it is trained.
+    """Return where the first parameter of each network is, the parameter, and whether it trains.
 
     Parameters are replaced or frozen all at once, by ``load_state_dict(assign=True)`` or
     ``actor.requires_grad_(False)`` for example.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch as th
 
 from sb3_flowpolicy.engine.adam import AdamSettings, adam_step
@@ -30,10 +31,10 @@ class TrainState(NamedTuple):
     actor: th.Tensor
     critic: th.Tensor
     target: th.Tensor
-    temperature: th.Tensor  # (S, 1): log of the entropy coefficient if learned, else itself
+    ent_coef: th.Tensor  # (S, 1): its logarithm if it is learned
     actor_moments: Moments
     critic_moments: Moments
-    ent_coef_moments: Moments | None  # None: the temperature is fixed
+    ent_coef_moments: Moments | None  # None: the entropy coefficient is fixed
 
     def of(self, seeds: slice) -> TrainState:
         """Return some seeds' part, as views."""
@@ -41,7 +42,7 @@ class TrainState(NamedTuple):
             self.actor[seeds],
             self.critic[seeds],
             self.target[seeds],
-            self.temperature[seeds],
+            self.ent_coef[seeds],
             self.actor_moments.of(seeds),
             self.critic_moments.of(seeds),
             None if self.ent_coef_moments is None else self.ent_coef_moments.of(seeds),
@@ -71,6 +72,14 @@ class Batch(NamedTuple):
             self.noise[:, seeds],
         )
 
+    def columns(self, seed: int) -> dict[str, np.ndarray]:
+        """Return one seed's observations, actions, rewards and next observations, (B, ...)."""
+        names = {"observations": "obs", "next_observations": "next_obs"}
+        return {
+            column: getattr(self, names.get(column, column))[seed].detach().cpu().numpy()
+            for column in ("observations", "actions", "rewards", "next_observations")
+        }
+
 
 LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 """What SB3 logs of an update: the rows of the tensor (4, S) that an update returns."""
@@ -85,7 +94,7 @@ class UpdateSettings:
     target_entropy: float
     actor_adam: AdamSettings
     critic_adam: AdamSettings
-    ent_coef_adam: AdamSettings | None  # None: the temperature is fixed
+    ent_coef_adam: AdamSettings | None  # None: the entropy coefficient is fixed
 
 
 # (state, batch, learning rates, whether to move the target networks) -> losses, (4, S)
@@ -95,7 +104,7 @@ Update = Callable[[TrainState, Batch, th.Tensor, bool], th.Tensor]
 def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
     r"""Return the function that performs one update of all seeds, in place.
 
-    It is SB3's ``SAC.train``, in its order: temperature, critics, actor, target networks.
+    It is SB3's ``SAC.train``, in its order: entropy coefficient, critics, actor, target networks.
 
     .. math::
         y &= r + \gamma (1 - d) (\min_c Q_c^{target}(s', a') - \alpha \log \pi(a' | s')) \\
@@ -107,8 +116,8 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         settings: Constants of the update.
 
     Returns:
-        Function of (state, batch, learning rates of actor, critics and temperature, whether to
-        move the target networks), which returns the losses (4, S), see ``LOSSES``.
+        Function of (state, batch, learning rates of actor, critics and entropy coefficient,
+        whether to move the target networks), which returns the losses (4, S), see ``LOSSES``.
 
     References:
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.
@@ -120,21 +129,21 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         actor = state.actor.detach().requires_grad_()
         actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
 
-        # The temperature in force is the one before its own step.
+        # As in SB3, this update uses the coefficient before its own step.
         if settings.ent_coef_adam is None:
-            ent_coef = state.temperature
+            ent_coef = state.ent_coef
             ent_coef_loss = th.zeros_like(ent_coef)
         else:
-            ent_coef = state.temperature.exp()
+            ent_coef = state.ent_coef.exp()
             # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
             surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
-            ent_coef_loss = -(state.temperature * surplus)
+            ent_coef_loss = -(state.ent_coef * surplus)
             assert state.ent_coef_moments is not None
             moments = state.ent_coef_moments
             stepped = adam_step(
-                state.temperature, -surplus, *moments, learning_rates[2], settings.ent_coef_adam
+                state.ent_coef, -surplus, *moments, learning_rates[2], settings.ent_coef_adam
             )
-            for old, new in zip((state.temperature, *moments), stepped, strict=True):
+            for old, new in zip((state.ent_coef, *moments), stepped, strict=True):
                 old.copy_(new)
 
         with th.no_grad():
@@ -172,7 +181,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         ):
             for old, new in zip(olds, news, strict=True):
                 old.copy_(new)
-        temperature = ent_coef.squeeze(-1), ent_coef_loss.squeeze(-1)
-        return th.stack([*temperature, critic_loss.detach(), actor_loss.detach()])
+        losses = ent_coef.squeeze(-1), ent_coef_loss.squeeze(-1), critic_loss, actor_loss
+        return th.stack([loss.detach() for loss in losses])
 
     return update

@@ -11,9 +11,10 @@ import numpy as np
 import torch as th
 from filelock import FileLock, Timeout
 
-from sb3_flowpolicy.algorithms.sac_flow import UPDATES_WORTH_COMPILING, SACFlow
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.common.files import read_json, write_json
 from sb3_flowpolicy.common.machine import machine
+from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
 from sb3_flowpolicy.experiments.measures import (
     MEASURES,
     TRAINING_INFOS,

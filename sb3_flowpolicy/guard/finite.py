@@ -1,4 +1,4 @@
-"""What comes from outside is finite, or refused before it does harm."""
+"""Reject NaN and infinity in what environments return and policies are shown."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ ENVIRONMENT = "environment {}".format
 
 
 class NonFiniteError(ValueError):
-    """Something that has to be finite is not.
+    """A value is NaN or infinite, or too large for float32.
 
     Args:
         message: What happened, and what to do about it.
-        tensor: Name of what is not finite: a loss, a parameter, ``"rewards"``, ...
+        tensor: Name of the value: a loss, a parameter, ``"rewards"``, ...
         value: NaN or infinity.
         step: Environment steps done.
-        update: Update in which it happened, from 1; None if it was none.
+        update: Update in which it happened, from 1; None if it was not in an update.
         seed: Seed of the agent; None if it has none.
-        batch: Of the minibatch of that update, column by column: ``"low"`` and ``"high"`` of the
+        batch: Summary of the minibatch of that update, by column: ``"low"`` and ``"high"`` of the
             finite values, how many are ``"not_finite"``, and the ``"row"`` of the first of these,
-            or else of the largest; empty where the minibatch is not known.
-        restored: Number of updates that the weights have seen that the agents were left with; None
-            if they were left alone.
+            or else of the largest; empty if the minibatch is not known.
+        restored: Number of updates before the weights that were restored; None if none were.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class NonFiniteError(ValueError):
 
 
 def all_finite(values: np.ndarray) -> bool:
-    """Whether an array is finite as float32, which is what networks are shown.
+    """Whether an array is finite as float32, the type that networks work with.
 
     Example:
         >>> all_finite(np.array([1.0, 1e30])), all_finite(np.array([1.0, 1e300]))
@@ -56,7 +55,7 @@ def all_finite(values: np.ndarray) -> bool:
     """
     if values.dtype.kind != "f":
         return True
-    # One pass of BLAS takes a third of the time of isfinite().all(): this is asked at every step.
+    # One pass of BLAS takes a third of the time of isfinite().all(), and this runs at every step.
     if float(np.vdot(values, values)) < _SURELY_FINITE:
         return True
     with np.errstate(over="ignore"):
@@ -74,10 +73,10 @@ def check_observation(observation: Any) -> None:
 
 
 def check_experience(columns: Mapping[str, Any], step: int, who: Callable[[int], str]) -> None:
-    """Refuse what environments hand out before it enters a replay buffer.
+    """Reject non-finite values from environments before they enter a replay buffer.
 
     Args:
-        columns: Name -> what N environments handed out, (N, ...), or a dictionary of such arrays.
+        columns: Name -> array of N environments, (N, ...), or a dictionary of such arrays.
         step: Environment steps done, for the message.
         who: Names an environment by its index.
 
@@ -115,7 +114,7 @@ def check_step(
     infos: Sequence[Mapping[str, Any]],
     step: int,
 ) -> None:
-    """Refuse what a step of an SB3 ``VecEnv`` returned, if any of it is not finite.
+    """Reject the result of a step of an SB3 ``VecEnv`` if any of it is not finite.
 
     Args:
         observations: Observations, the first of the next episode where one ended.
@@ -127,7 +126,7 @@ def check_step(
     Raises:
         NonFiniteError: As :func:`check_experience`.
     """
-    # The ordinary step, in as few calls as can be: between two updates nothing is in the cache.
+    # The ordinary step takes as few calls as possible: between two updates the cache is cold.
     ordinary = type(observations) is np.ndarray and observations.dtype.kind == "f"
     seen = observations.ravel() if ordinary else rewards
     if not float(seen.dot(seen)) + float(rewards.dot(rewards)) < _SURELY_FINITE or not ordinary:
@@ -153,7 +152,7 @@ def _arrays(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _first(values: np.ndarray) -> tuple[tuple[int, ...], float]:
-    """Return where the first value is that is not finite, and that value."""
+    """Return the index of the first non-finite value, and the value."""
     with np.errstate(over="ignore"):
         bad = ~np.isfinite(values.astype(np.float32))
     at = tuple(int(i) for i in np.argwhere(bad)[0])

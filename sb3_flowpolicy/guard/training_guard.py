@@ -1,11 +1,11 @@
-"""The training guard: no run goes on with NaN, and none ends with it."""
+"""The training guard: a run with NaN or infinity stops, and returns to its last finite state."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 import torch as th
@@ -13,30 +13,32 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_flowpolicy.guard.finite import NonFiniteError
 
-# Losses tell of most mischief at once. An infinity that a relu or a clamp hides from them is found
-# at the next look at everything, which takes about as long as one update of small networks.
+# Most failures show up in the losses first. An infinity that a relu or a clamp hides from them is
+# found at the next look at everything, which takes about as long as one update of small networks.
 UPDATES_BETWEEN_LOOKS = 2000
 # Ordinary rewards and observations are far below; worth pointing at when training has failed.
 _EXTREME = 1e6
-# Name in messages -> field of the engine's minibatch, attribute of SB3's replay buffer.
-_COLUMNS = {
-    "observations": ("obs", "observations"),
-    "actions": ("actions", "actions"),
-    "rewards": ("rewards", "rewards"),
-    "next_observations": ("next_obs", "next_observations"),
-}
+_COLUMNS = ("observations", "actions", "rewards", "next_observations")
+
+
+class Minibatch(Protocol):
+    """What the guard asks of a minibatch: its columns, by the names of SB3's replay buffer."""
+
+    def columns(self, seed: int) -> Mapping[str, np.ndarray]:
+        """Return the columns of one seed."""
 
 
 class TrainingGuard:
-    """Watches losses, parameters and optimisers of S agents that are trained in lockstep.
+    """Checks losses, parameters and optimizers of S agents that are trained in lockstep.
 
-    Every 2000th update it makes sure that all parameters and optimiser states are finite, and
-    remembers them. After every call of ``train()`` it looks at the losses. If anything is not
-    finite it puts back what it remembers, in all agents, and raises :class:`NonFiniteError`: the
-    agents are left as they were at most 2000 updates before, and can be used and saved.
+    Every 2000th update it checks that all parameters and optimizer states are finite, and copies
+    them. After every call of ``train()`` it checks the losses. If anything is not finite, it
+    restores the copies in all agents and raises :class:`NonFiniteError`: the agents are as they
+    were at most 2000 updates before, and can be used and saved.
 
     Args:
-        models: The agents, of SAC or an algorithm that descends from it, equally many updates old.
+        models: The agents, which have done equally many updates. Besides SB3's attributes they
+            need a method ``optimizers()``, which returns their optimizers by name.
         seeds: Their seeds, to be named in messages.
 
     Example:
@@ -54,17 +56,20 @@ class TrainingGuard:
     ) -> None:
         self.models = models
         self.seeds = seeds
-        #: Folder of the checkpoints that are being written, to be named in messages.
-        self.resume_from: str | Path | None = None
         self.restart()
 
-    def restart(self) -> None:
-        """Forget what was remembered: the next weights may not be those of the last update."""
+    def restart(self, resume_from: str | Path | None = None) -> None:
+        """Discard the copies, when learning begins.
+
+        Args:
+            resume_from: Folder of the checkpoints that are being written, to be named in messages.
+        """
+        self.resume_from = resume_from
         self._kept: list[_Snapshot] = []
         self._kept_at, self._due = 0, -1
 
     def look(self) -> list[_Snapshot]:
-        """Return what training changes, agent by agent, after making sure that it is finite.
+        """Copy what training changes, agent by agent, and check that it is finite.
 
         Raises:
             NonFiniteError: If any of it is not.
@@ -80,7 +85,7 @@ class TrainingGuard:
         return found
 
     def before_updates(self) -> None:
-        """Look at everything and remember it, if that is due.
+        """Check and copy everything, if that is due.
 
         Raises:
             NonFiniteError: If any of it is not finite.
@@ -95,20 +100,20 @@ class TrainingGuard:
         names: Sequence[str],
         losses: Sequence[Sequence[float]],
         history: Sequence[th.Tensor] = (),
-        batches: Sequence[Any] = (),
+        batches: Sequence[Minibatch] = (),
     ) -> None:
-        """Look at the losses of the updates that were just done.
+        """Check the losses of the updates that were just done.
 
         Args:
             names: Names of the losses.
             losses: Their means over these updates, (len(names), S).
-            history: The losses of each update, (len(names), S); nothing where not known.
-            batches: The minibatches of each update (``engine.update.Batch``).
+            history: The losses of each update, (len(names), S); empty if not known.
+            batches: The minibatches of each update; empty if not known.
 
         Raises:
             NonFiniteError: If one of them is not finite.
         """
-        if math.isfinite(sum(map(sum, losses))):  # asked after every update: in one go
+        if math.isfinite(sum(map(sum, losses))):
             return
         for name, values in zip(names, losses, strict=True):
             for index, value in enumerate(values):
@@ -122,9 +127,9 @@ class TrainingGuard:
         value: float,
         index: int,
         history: Sequence[th.Tensor],
-        batches: Sequence[Any],
+        batches: Sequence[Minibatch],
     ) -> NoReturn:
-        """Find out where it began, for it spreads to all losses within two updates, and stop."""
+        """Find the first loss that failed, as all losses fail within two updates, and stop."""
         update, when, where = None, "in the last updates", "replay buffer"
         all_losses = th.stack(list(history)) if history else th.empty(0)
         bad = (~all_losses.isfinite()).nonzero()
@@ -133,13 +138,10 @@ class TrainingGuard:
             name, value = names[row], all_losses[k, row, index].item()
             update = self.models[index]._n_updates - len(history) + k + 1
             when, where = f"in update {update}", "minibatch"
-            columns = {
-                column: getattr(batches[k], field)[index].detach().cpu().numpy()
-                for column, (field, _) in _COLUMNS.items()
-            }
+            columns = batches[k].columns(index)
         else:
             buffer = self.models[index].replay_buffer
-            columns = {column: getattr(buffer, name) for column, (_, name) in _COLUMNS.items()}
+            columns = {column: getattr(buffer, column) for column in _COLUMNS}
         summary = {
             column: _summary(values)
             for column, values in columns.items()
@@ -173,7 +175,7 @@ class TrainingGuard:
 
     @th.no_grad()
     def _restore(self) -> int | None:
-        """Put back what was remembered; return how many updates that had seen."""
+        """Restore the copies; return the number of updates before them."""
         if not self._kept:
             return None
         for model, snapshot in zip(self.models, self._kept, strict=True):
@@ -181,14 +183,14 @@ class TrainingGuard:
             for name, tensor in _training_tensors(model).items():
                 if name in kept:
                     tensor.copy_(kept[name].view_as(tensor))
-                else:  # an optimiser's state, which begins to exist with its first step
+                else:  # an optimizer's state, which is created by its first step
                     tensor.zero_()
             model._n_updates = self._kept_at
         return self._kept_at
 
 
 class _Snapshot:
-    """A copy of many tensors in one: copied and looked at in one go."""
+    """A copy of many tensors in one, which makes copying and checking fast."""
 
     def __init__(self, tensors: Mapping[str, th.Tensor]) -> None:
         self.sizes = {name: tensor.numel() for name, tensor in tensors.items()}
@@ -202,7 +204,7 @@ class _Snapshot:
 
     def find_non_finite(self) -> str | None:
         """Return the name of a tensor that is not finite, None if all are."""
-        # A sum takes a twentieth of the time; only if it is not finite, why?
+        # A sum takes a twentieth of the time of looking at every number.
         if math.isfinite(self.flat.sum().item()):
             return None
         bad = (name for name, values in self.tensors().items() if not values.isfinite().all())
@@ -210,18 +212,12 @@ class _Snapshot:
 
 
 def _training_tensors(model: Any) -> dict[str, th.Tensor]:
-    """Everything that an update changes, by name; sharing memory with the model."""
+    """Return everything that an update changes, by name; sharing memory with the model."""
     states: dict[str, th.Tensor] = dict(model.policy.state_dict())
     if model.log_ent_coef is not None:
         states["log_ent_coef"] = model.log_ent_coef.detach()
-    optimizers = {
-        "actor": model.actor.optimizer,
-        "critic": model.critic.optimizer,
-        "ent_coef": model.ent_coef_optimizer,
-    }
-    for owner, optimizer in optimizers.items():
-        groups = [] if optimizer is None else optimizer.param_groups
-        parameters = [parameter for group in groups for parameter in group["params"]]
+    for owner, optimizer in model.optimizers().items():
+        parameters = [one for group in optimizer.param_groups for one in group["params"]]
         for number, parameter in enumerate(parameters):
             for key, state in optimizer.state.get(parameter, {}).items():
                 states[f"{owner}.optimizer.{number}.{key}"] = state

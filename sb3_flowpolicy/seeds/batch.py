@@ -14,14 +14,10 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.checkpoint.session import (
-    between_rollouts,
-    finishing,
-    start_checkpoints,
-)
-from sb3_flowpolicy.engine import LOSSES, Engine, settings_key
+from sb3_flowpolicy.checkpoint.session import RunCheckpoints
+from sb3_flowpolicy.engine import LOSSES, EngineRuntime, settings_key
 from sb3_flowpolicy.guard.finite import check_experience
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.policies import FlowActor
@@ -36,6 +32,7 @@ from sb3_flowpolicy.seeds.setup import (
     make_env,
     make_progress_bar,
     make_vec_env,
+    refuse,
 )
 from sb3_flowpolicy.seeds.storage import SeedNoise, SeedStorage
 
@@ -105,7 +102,9 @@ class SeedBatch(BatchOnDisk):
         first = models[0]
         check_stackable(first)
         self._storage = SeedStorage(self._buffers())
-        self._engine: Engine | None = None
+        self._runtime = EngineRuntime(models, refuse)
+        self._checkpoints = RunCheckpoints(self._describe_run)
+        self._exploration = ColoredExploration()
         self._episodes = SeedEpisodes(
             self._models, self.seeds, self._before_dump, monitor_dir, info_keywords
         )
@@ -113,7 +112,6 @@ class SeedBatch(BatchOnDisk):
         self._losses: list[list[float]] | None = None
         self._venv = make_vec_env(env, len(seeds))
         self._obs: np.ndarray | None = None
-        self._process: NoiseProcess | None = None
         self._noise: dict[str, SeedNoise] = {}
         self._fit_noise()
 
@@ -125,7 +123,8 @@ class SeedBatch(BatchOnDisk):
         first, before = self._models[0], self._noise
         assert isinstance(first.actor, FlowActor)
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
-        process = first.fit_noise_process(self._process, len(self.seeds), self._venv)
+        self._exploration.fit(first, len(self.seeds), self._venv)
+        process = self._exploration.process
         white_shape = (1, noise_dim) if process is None else process.white_shape[1:]
         # Name -> shape, and whether it is uniform.
         wanted = {
@@ -134,7 +133,6 @@ class SeedBatch(BatchOnDisk):
             "updates": ((2, first.batch_size, noise_dim), False),
             "rows": ((first.batch_size,), True),
         }
-        self._process = process
         self._noise = {
             name: before[name]
             if name in before and before[name].shape == needed
@@ -180,8 +178,10 @@ class SeedBatch(BatchOnDisk):
             NonFiniteError: If an environment hands out, or training arrives at, NaN or infinity;
                 see :class:`~sb3_flowpolicy.guard.training_guard.TrainingGuard`.
         """
-        with finishing(self):
-            start_checkpoints(self, checkpoint_path, checkpoint_every)
+        with (
+            self._checkpoints.learning(checkpoint_path, checkpoint_every),
+            self._runtime.running(watched=callback is not None),
+        ):
             callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
             self._learn(callbacks, log_interval, reset_num_timesteps, progress_bar)
         return self
@@ -201,8 +201,7 @@ class SeedBatch(BatchOnDisk):
             self._obs, _ = self._venv.reset(seed=seeds)  # type: ignore[arg-type]
             check_experience({"observations": self._obs}, first.num_timesteps, self._who)
             self._episodes.restart()
-            if self._process is not None:
-                self._process.restart()
+            self._exploration.restart()
         to_go = first._total_timesteps - first.num_timesteps
         bar = make_progress_bar(to_go) if progress_bar else None
         try:
@@ -213,8 +212,6 @@ class SeedBatch(BatchOnDisk):
             if bar is not None:
                 bar.close()
             self._storage.publish()
-            assert self._engine is not None
-            self._engine.release()
         for one in callbacks:
             one.on_training_end()
 
@@ -227,7 +224,7 @@ class SeedBatch(BatchOnDisk):
         named = dict(zip(self._describe_run().agents, callbacks, strict=False))
         going = True
         while going and first.num_timesteps < total:
-            if not between_rollouts(self, named):
+            if not self._checkpoints.between_rollouts(named):
                 break
             for one in callbacks:
                 one.on_rollout_start()
@@ -240,9 +237,6 @@ class SeedBatch(BatchOnDisk):
             if bar is not None:
                 bar.update(collected)
             if going and first.num_timesteps > first.learning_starts and first.gradient_steps:
-                # Only callbacks can have loaded or reset anything since the last update.
-                if callbacks and self._engine is not None and self._engine.synchronize():
-                    check_stackable(first)
                 self._train()
 
     def _start(
@@ -257,11 +251,10 @@ class SeedBatch(BatchOnDisk):
         for seed, model in zip(self.seeds, self._models, strict=True):
             own = copy_callback(callback, seed)
             name = f"{tb_log_name}_seed{seed}"
+            total, reset = self._checkpoints.remaining(total_timesteps, reset_num_timesteps)
             # SB3 draws the first observation from the model's own environment; ours are stepped.
-            model._resumption = self._resumption
-            _, ready = model._setup_learn(total_timesteps, own, reset_num_timesteps, name)
-            model._resumption = None
-            if model._checkpoints is not None and model._checkpoints.active:
+            _, ready = model._setup_learn(total, own, reset, name)
+            if model._checkpoints.active:
                 model._checkpoints.stop()
                 raise ValueError(
                     "a batch is checkpointed by learn(checkpoint_every=..., checkpoint_path=...), "
@@ -276,22 +269,12 @@ class SeedBatch(BatchOnDisk):
         """Make engine, storage and noise fit what was done to the agents since the last run."""
         first, models = self._models[0], self._models
         check_stackable(first)
-        settings = settings_key(first, first.critic_loss_coef)
         if any(_shared_settings(model) != _shared_settings(first) for model in models[1:]):
             raise ValueError("agents must all have the same settings, got different ones")
-        compiled = first._worth_compiling if first.compile == "auto" else bool(first.compile)
-        engine = self._engine
-        if engine is not None:
-            compiled = compiled or engine.compiled
-            has = engine.settings_key, engine.compiled, engine.autocast
-            if not engine.belongs_to(models) or has != (settings, compiled, first.autocast):
-                engine.release()
-                self._engine = None
-        if self._engine is None:
-            self._engine = Engine(models, first.critic_loss_coef, compiled, first.autocast)
-        self._engine.synchronize()
-        self._guard.restart()
-        self._guard.resume_from = None if self._checkpoints is None else self._checkpoints.path
+        # A resumed call of learn() was counted when it began.
+        if not self._checkpoints.resuming:
+            self._runtime.planned = first._runtime.planned
+        self._guard.restart(self._checkpoints.path)
         buffers = self._buffers()
         # An agent that was trained on its own has its buffer's arrays to itself since then.
         if not self._storage.rows.holds(buffers):
@@ -325,8 +308,7 @@ class SeedBatch(BatchOnDisk):
             timeouts=truncated & ~terminated,
         )
         self._obs = obs
-        if self._process is not None:
-            self._process.restart(dones)
+        self._exploration.restart(dones)
         for model in self._models:
             model.num_timesteps += 1
             model._current_progress_remaining = 1 - model.num_timesteps / model._total_timesteps
@@ -350,30 +332,32 @@ class SeedBatch(BatchOnDisk):
         random_steps = first.learning_starts if first.random_steps is None else first.random_steps
         if first.num_timesteps < random_steps:
             return (self._noise["random actions"].draw() * 2 - 1).float().numpy()
-        assert self._engine is not None
         noise = self._noise["actions"].draw()
-        if self._process is not None:
-            noise = self._process.step(noise).unsqueeze(1)
-        actions = self._engine.act(th.from_numpy(obs).unsqueeze(1), noise)
+        if self._exploration.process is not None:
+            noise = self._exploration.process.step(noise).unsqueeze(1)
+        engine = self._runtime.engine()
+        assert engine is not None
+        actions = engine.act(th.from_numpy(obs).unsqueeze(1), noise)
         return actions.squeeze(1).numpy().reshape(len(obs), *(first.action_space.shape or ()))
 
     def _train(self) -> None:
         """Update all agents ``gradient_steps`` times."""
-        assert self._engine is not None
+        engine = self._runtime.engine()
+        assert engine is not None
         first = self._models[0]
         rate = first.lr_schedule(first._current_progress_remaining)
         if rate != first.actor.optimizer.param_groups[0]["lr"]:
             for model in self._models:
-                for optimizer in model.optimizers():
+                for optimizer in model.optimizers().values():
                     update_learning_rate(optimizer, rate)
         self._guard.before_updates()
         rows = self._noise["rows"].draw_many(first.gradient_steps)
         noise = self._noise["updates"].draw_many(first.gradient_steps).transpose(1, 2)
         batches = self._storage.gather(rows, first.gamma, noise)
-        self._losses = self._engine.train(batches).tolist()
+        self._losses = engine.train(batches).tolist()
         for model in self._models:
             model._n_updates += first.gradient_steps
-        self._guard.after_updates(LOSSES, self._losses, self._engine.history, batches)
+        self._guard.after_updates(LOSSES, self._losses, engine.history, batches)
 
     def _before_dump(self, seed: int) -> None:
         """Record what SB3 records at each update only now that somebody reads it."""

@@ -10,17 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.segments import Ring
-from sb3_flowpolicy.checkpoint.session import (
-    Checkpoints,
-    Resumption,
-    load_agent,
-    open_checkpoint,
-    take_up,
-)
+from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
+from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.checkpoint import read_batch, write_batch
 from sb3_flowpolicy.seeds.episodes import SeedEpisodes
@@ -42,9 +37,9 @@ class BatchOnDisk:
     _obs: np.ndarray | None
     _losses: list[list[float]] | None
     _guard: TrainingGuard
-    _process: NoiseProcess | None
-    _checkpoints: Checkpoints | None = None
-    _resumption: Resumption | None = None
+    _exploration: ColoredExploration
+    _checkpoints: RunCheckpoints
+    _runtime: EngineRuntime
 
     @abstractmethod
     def _adopt(
@@ -134,7 +129,7 @@ class BatchOnDisk:
         batch = cls.__new__(cls)
         seeds = [int(name.removeprefix("seed_")) for name in checkpoint.manifest["agents"]]
         batch._adopt(models, seeds, env, monitor_dir, info_keywords)
-        batch._resumption = take_up(batch._describe_run(), store, checkpoint)
+        batch._checkpoints.load(store, checkpoint)
         batch._storage.publish()
         return batch
 
@@ -163,15 +158,16 @@ class BatchOnDisk:
             "episodes": self._episodes.state(),
             "obs": self._obs,
             "losses": self._losses,
-            "process": None if self._process is None else self._process.state(),
+            "exploration": self._exploration.state(),
+            "engine": self._runtime.state(),
         }
 
     def _set_extra_state(self, state: dict[str, Any]) -> None:
         for name, one in self._noise.items():
             one.set_state(state["noise"][name])
         self._losses = state["losses"]
-        if self._process is not None:
-            self._process.set_state(state["process"])
+        self._exploration.load_state(state["exploration"])
+        self._runtime.load_state(state["engine"])
         self._episodes.set_state(state["episodes"])
         if self._resumes_episodes():
             self._obs = state["obs"]
@@ -180,4 +176,4 @@ class BatchOnDisk:
 
     def _resumes_episodes(self) -> bool:
         """Whether the next step belongs to episodes that a resumed batch was in."""
-        return self._resumption is not None and "batch" not in self._resumption.run.opaque
+        return self._checkpoints.resuming and "batch" not in self._checkpoints.opaque

@@ -61,7 +61,7 @@ def check_stackable(model: SACFlow) -> None:
     if reason is None and is_image_space(model.observation_space):
         reason = "image observations"
     if reason is not None:
-        raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
+        refuse(reason)
     assert isinstance(model.train_freq, TrainFreq)
     if model.train_freq.unit is not TrainFrequencyUnit.STEP or model.gradient_steps < 0:
         raise ValueError(
@@ -73,6 +73,11 @@ def check_stackable(model: SACFlow) -> None:
             "agents must collect on the CPU and without action_noise, got "
             f"device {model.device} and action_noise {model.action_noise}"
         )
+
+
+def refuse(reason: str) -> None:
+    """Raise ``ValueError`` with the reason why the engine cannot stack agents."""
+    raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
 
 
 def make_env(env: str | EnvFactory) -> gym.Env:

@@ -94,8 +94,8 @@ def test_names_of_policies(algorithm: Any) -> None:
         algorithm("NoPolicy", ENV)
 
 
-def test_on_policy_algorithms_have_no_coloured_noise() -> None:
-    with pytest.raises(ValueError, match=r"off-policy algorithms: .* got {'action_noise_color': 1"):
+def test_on_policy_algorithms_have_no_colored_noise() -> None:
+    with pytest.raises(TypeError, match="unexpected keyword argument 'action_noise_color'"):
         PPOFlow("FlowPolicy", ENV, action_noise_color=1.0)
 
 
@@ -143,7 +143,6 @@ def test_bad_arguments_of_one_algorithm() -> None:
     ("arguments", "message"),
     [
         ({"n_steps": 2.5}, "n_steps must be an integer of at least 1, got 2.5"),
-        ({"n_steps": 1}, "n_steps"),
         ({"n_epochs": 0}, "n_epochs must be an integer of at least 1, got 0"),
         ({"gamma": 2}, "gamma must be at most 1, got 2"),
         ({"clip_range": 0.0}, "clip_range must be above 0, got 0.0"),
@@ -161,6 +160,11 @@ def test_bad_arguments_of_ppo(arguments: dict[str, Any], message: str) -> None:
         PPOFlow(**{"policy": "FlowPolicy", "env": ENV, "n_steps": 32, **arguments})
 
 
+def test_ppo_leaves_what_sb3_refuses_to_sb3() -> None:
+    with pytest.raises(AssertionError, match="n_steps"):
+        PPOFlow("FlowPolicy", ENV, n_steps=1)
+
+
 def test_good_arguments_of_ppo() -> None:
     """What SB3 takes, ours takes."""
     PPOFlow("FlowPolicy", ENV, n_steps=32, clip_range=lambda left: 0.2 * left, target_kl=None)
@@ -176,12 +180,6 @@ def test_good_arguments_of_ppo() -> None:
         PPOFlow("FlowPolicy", ENV, n_steps=32, policy_kwargs={"net_arch": [{"pi": [4], "vf": [4]}]})
 
 
-def test_loading_ppo_takes_no_coloured_noise(tmp_path: Path) -> None:
-    PPOFlow("FlowPolicy", ENV, n_steps=32).save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"off-policy algorithms: .* got {'action_noise_color': 9"):
-        PPOFlow.load(tmp_path / "model", action_noise_color=9.0)
-
-
 @pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow, CrossQFlow, PPOFlow])
 def test_policies_of_other_observations(algorithm: Any) -> None:
     with pytest.raises(ValueError, match=r"observation_space must be no Dict .* MultiInput"):
@@ -193,5 +191,5 @@ def test_policies_of_other_observations(algorithm: Any) -> None:
 
 @OFF_POLICY
 def test_other_action_spaces(algorithm: Any) -> None:
-    with pytest.raises(ValueError, match="Discrete"):
+    with pytest.raises(AssertionError, match="Discrete"):
         algorithm("FlowPolicy", "CartPole-v1")

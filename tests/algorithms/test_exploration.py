@@ -61,8 +61,8 @@ def test_at_a_fixed_state_actions_are_distributed_as_ever(
 ) -> None:
     white, colored = fixed_state(policy, 500), fixed_state(policy, 500, **color)
     colored.actor.load_state_dict(white.actor.state_dict())
-    assert colored._noise_process is not None
-    colored._noise_process.restart()
+    assert colored._exploration.process is not None
+    colored._exploration.process.restart()
     (first, *_, last), (reference,) = act(colored, 6), act(white, 1)
     along = np.array([[1, 0], [0, 1], [1, 1], [1, -1]]).T
     for actions in (first, last):
@@ -118,13 +118,13 @@ def test_compiled_or_not_the_actions_are_the_same() -> None:
     found = []
     for compiled in (False, True):
         model = fixed_state("FlowPolicy", action_noise_color=0.5)
-        if compiled:
-            model._ready_engine()
-            assert model._engine is not None
-            model._engine.compiled = True  # takes the engine's path, whose function stays eager
-            model._engine._compiled_sample.broken = True
-        th.manual_seed(5)
-        found.append(act(model, 3))
+        with model._runtime.running():
+            if compiled:  # takes the engine's path, whose function stays eager
+                engine = model._runtime.engine()
+                assert engine is not None
+                engine.compiled = engine._compiled_sample.broken = True
+            th.manual_seed(5)
+            found.append(act(model, 3))
     np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6)
 
 
@@ -209,21 +209,21 @@ def test_gsde_has_noise_of_its_own() -> None:
 
 def decays(model: SACFlow) -> int:
     """Number of the process's components: it tells processes of different settings apart."""
-    assert model._noise_process is not None
-    return model._noise_process.white_shape[1]
+    assert model._exploration.process is not None
+    return model._exploration.process.white_shape[1]
 
 
 def test_settings_that_change_change_the_process(tmp_path: Path) -> None:
     model = SACFlow("GaussPolicy", "TunnelDiagonal-v0", **FAST, action_noise_color=1.0).learn(12)
-    first, pink = model._noise_process, decays(model)
+    first, pink = model._exploration.process, decays(model)
     model.learn(4, reset_num_timesteps=False)
-    assert model._noise_process is first
+    assert model._exploration.process is first
     model.set_env(gym.make("TunnelDiagonal-v0", max_episode_steps=4000))
     model.learn(4, reset_num_timesteps=False)
     assert decays(model) > pink
     model.action_noise_color = 0.0
     model.learn(4, reset_num_timesteps=False)
-    assert model._noise_process is None
+    assert model._exploration.process is None
     model.action_noise_correlation_time = 5.0
     model.learn(4, reset_num_timesteps=False)
     assert decays(model) == 1
@@ -240,18 +240,18 @@ def test_settings_of_a_batch_can_change() -> None:
     settings = {name: value for name, value in FAST.items() if name != "seed"}
     batch = SeedBatch("GaussPolicy", "TunnelDiagonal-v0", 2, **settings)
     batch.learn(12)
-    assert batch._process is None
+    assert batch._exploration.process is None
     updates = batch._noise["updates"]
     for model in batch.models:
         model.action_noise_color = 1.0
     batch.learn(4, reset_num_timesteps=False)
-    assert batch._process is not None
-    assert batch._noise["actions"].shape == batch._process.white_shape[1:]
+    assert batch._exploration.process is not None
+    assert batch._noise["actions"].shape == batch._exploration.process.white_shape[1:]
     assert batch._noise["updates"] is updates  # whose numbers go on
     for model in batch.models:
         model.action_noise_color = 0.0
     batch.learn(4, reset_num_timesteps=False)
-    assert batch._process is None
+    assert batch._exploration.process is None
 
 
 def test_processes_need_not_send_their_spec() -> None:

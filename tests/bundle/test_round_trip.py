@@ -19,7 +19,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import BundleError, SACFlow
-from sb3_flowpolicy.common.settings import SETTINGS
 from sb3_flowpolicy.distributions import registered_distributions
 from tests.bundle.conftest import FAST, NET, UNUSUAL, behind_statistics, make_model, multi_env
 
@@ -125,7 +124,7 @@ def test_acts_and_learns_on_as_if_never_saved(case: str, tmp_path: Path) -> None
             actions.append(one.predict(obs, deterministic=deterministic)[0])
         np.testing.assert_array_equal(*actions)
     assert_same_bits(model, loaded)
-    for name in SETTINGS:
+    for name in SACFlow.settings:
         name = "_stats_window_size" if name == "stats_window_size" else name
         assert getattr(loaded, name) == getattr(model, name), name
     # With the same replay data, the next updates are the same numbers.
@@ -234,7 +233,7 @@ def test_every_argument_of_the_constructor_is_held_or_left_out_on_purpose() -> N
     elsewhere = {"learning_rate", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
     refused = {"action_noise"}
     left_out = {"demonstrations", "tensorboard_log", "verbose", "device", "_init_setup_model"}
-    assert known == {*SETTINGS, *elsewhere, *refused, *left_out}
+    assert known == {*SACFlow.settings, *elsewhere, *refused, *left_out}
 
 
 @pytest.mark.parametrize(

@@ -126,9 +126,9 @@ def check_equal_to_sb3(
     seed_everything()
     ours.train(N_UPDATES, batch_size=BATCH_SIZE)
     assert isinstance(ours, SACFlow)
-    assert ours._engine is not None  # neither took SB3's loop ...
-    assert ours._engine.compiled == compile
-    assert not ours._engine._compiled_update.broken  # ... nor gave up compiling
+    assert ours._runtime._engine is not None  # neither took SB3's loop ...
+    assert ours._runtime._engine.compiled == compile
+    assert not ours._runtime._engine._compiled_update.broken  # ... nor gave up compiling
     assert_same(ours, stock, dtype)
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch as th
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.engine.subnormals import flushed_subnormals
+from sb3_flowpolicy.engine.arithmetic import flushed_subnormals
 
 TINY = 1e-40
 

@@ -149,11 +149,11 @@ def test_an_engine_that_no_longer_fits_is_dropped() -> None:
     model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
     assert isinstance(model, SACFlow)
     model.train(1, batch_size=BATCH_SIZE)
-    assert model._engine is not None
+    assert model._runtime._engine is not None
     model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=1e-3)
     with pytest.warns(UserWarning, match="optimizer of type SGD"):
         model.train(1, batch_size=BATCH_SIZE)
-    assert model._engine is None
+    assert model._runtime._engine is None
 
 
 def test_nan_stops_the_run() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch as th
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.engine.threads import WORTH_SHARING, threads_for
+from sb3_flowpolicy.engine.arithmetic import WORTH_SHARING, threads_for
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +30,7 @@ def test_an_update_takes_as_many_threads_as_it_is_worth(units: int, threads: int
         compile=False,
         seed=0,
     ).learn(21)
-    engine = model._engine
+    engine = model._runtime._engine
     assert engine is not None
     used = []
     update = engine._update

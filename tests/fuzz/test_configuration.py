@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from flowpolicy_envs import FindGoal, Hold, Move, SquareEnv, TunnelEnv
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
-from sb3_flowpolicy.common.settings import SETTINGS
 from sb3_flowpolicy.policies import FlowPolicy, LowRankPolicy
 from sb3_flowpolicy.seeds import _overrides
 from tests.fuzz.effort import fuzz
@@ -79,7 +78,7 @@ def test_tasks(task: Any, value: Any) -> None:
     works_or_says_why(task, held=value)
 
 
-CONSTRUCTOR = [*SETTINGS, "policy_kwargs", "verbose", "learning_rate"]
+CONSTRUCTOR = [*SACFlow.settings, "policy_kwargs", "verbose", "learning_rate"]
 
 
 @fuzz(250)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
-from sb3_flowpolicy.seeds import main
+from sb3_flowpolicy.seeds.__main__ import main
 
 TINY = ["--seeds", "2", "-params", "learning_starts:20", "random_steps:20", "batch_size:16"]
 

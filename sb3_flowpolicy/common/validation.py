@@ -1,12 +1,11 @@
-"""What the settings of an agent may be: one table, for the constructor and for files."""
+"""Checks of arguments, combined into tables: name of an argument -> check."""
 
 from __future__ import annotations
 
 import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,6 @@ from stable_baselines3.common.type_aliases import TrainFreq
 
 #: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
-
-MAX_COLOR = 1.5
-"""Largest exponent of the spectrum of exploration noise."""
 
 # What a JSON number holds without rounding.
 _ANY = 2**53
@@ -104,7 +100,7 @@ def is_number(value: Any) -> bool:
     return True
 
 
-def temperature(name: str, value: Any) -> str | float:
+def entropy_coefficient(name: str, value: Any) -> str | float:
     """Accept a number of at least 0, ``"auto"``, or ``"auto_0.1"`` with a value to begin with."""
     if not isinstance(value, str):
         return number(0)(name, value)
@@ -136,34 +132,7 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
-#: What an agent is, in plain values. A bundle holds all of these, and the constructor checks them.
-SETTINGS: dict[str, Check] = {
-    "buffer_size": integer(1),
-    "learning_starts": number(0),
-    "batch_size": integer(1),
-    "tau": number(0, 1),
-    "gamma": number(0, 1),
-    "train_freq": train_frequency,
-    "gradient_steps": integer(-1),
-    "optimize_memory_usage": flag,
-    "n_steps": integer(1),
-    "ent_coef": temperature,
-    "target_update_interval": integer(1),
-    "target_entropy": either("auto", number()),
-    "use_sde": flag,
-    "sde_sample_freq": integer(-1),
-    "use_sde_at_warmup": flag,
-    "stats_window_size": integer(1),
-    "seed": optional(integer(0, 2**32 - 1)),
-    "random_steps": optional(number(0)),
-    "critic_loss_coef": number(0, above=True),
-    "compile": either("auto", flag),
-    "autocast": flag,
-    "action_noise_color": number(0, MAX_COLOR),
-    "action_noise_correlation_time": optional(number(0, above=True)),
-}
-
-# Arguments of the constructor that are no part of the agent, or no plain values.
+# Arguments of every algorithm that are no plain values.
 _FURTHER: dict[str, Check] = {
     "policy_kwargs": optional(mapping),
     "replay_buffer_kwargs": optional(mapping),
@@ -172,38 +141,19 @@ _FURTHER: dict[str, Check] = {
 }
 
 
-#: The same for PPO.
-PPO_SETTINGS: dict[str, Check] = {
-    "n_steps": integer(1),
-    "batch_size": integer(1),
-    "n_epochs": integer(1),
-    "gamma": number(0, 1),
-    "gae_lambda": number(0, 1),
-    "clip_range": or_schedule(number(0, above=True)),
-    "clip_range_vf": optional(or_schedule(number(0, above=True))),
-    "normalize_advantage": flag,
-    "ent_coef": number(0),
-    "vf_coef": number(0),
-    "max_grad_norm": or_infinity(number(0, above=True)),
-    "target_kl": optional(number(0, above=True)),
-    "stats_window_size": integer(1),
-    "seed": optional(integer(0, 2**32 - 1)),
-}
-
-
-def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check] = SETTINGS) -> None:
-    """Check those arguments of an algorithm that are known here.
+def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check]) -> None:
+    """Check the arguments of an algorithm.
 
     Args:
         settings: Arguments by name.
-        table: What they may be. Default: that of SACFlow.
+        table: Checks by name; arguments that it does not list are not checked.
 
     Raises:
         ValueError: If one is of another type or out of range; the message names it.
 
     Example:
-        >>> check_settings({"gamma": 0.9, "policy_kwargs": {}})
-        >>> check_settings({"gamma": "high"})
+        >>> check_settings({"gamma": 0.9, "policy_kwargs": {}}, {"gamma": number(0, 1)})
+        >>> check_settings({"gamma": "high"}, {"gamma": number(0, 1)})
         Traceback (most recent call last):
         ...
         ValueError: gamma must be a number, got 'high'
@@ -214,7 +164,7 @@ def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check] = SET
 
 
 def by_name(algorithm: type, args: Iterable[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an algorithm's constructor by name, those by position as well.
+    """Return the positional and keyword arguments of a constructor by name.
 
     Example:
         >>> from stable_baselines3 import SAC
@@ -224,17 +174,8 @@ def by_name(algorithm: type, args: Iterable[Any], kwargs: Mapping[str, Any]) -> 
     return {**dict(zip(inspect.signature(algorithm).parameters, args, strict=False)), **kwargs}
 
 
-@contextmanager
-def assertions_as_value_errors() -> Iterator[None]:
-    """Turn ``AssertionError``, by which SB3 refuses environments, into ``ValueError``."""
-    try:
-        yield
-    except AssertionError as error:
-        raise ValueError(str(error)) from error
-
-
 def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
-    """Check that an algorithm can train a policy: one of its names, or a class of its kind.
+    """Check that a policy is one of an algorithm's names, or a class of its kind.
 
     Raises:
         ValueError: If the name is unknown, or the class belongs to another algorithm.

@@ -1,0 +1,61 @@
+"""CrossQFlow: sb3-contrib's CrossQ with our policies, colored exploration and exact resume."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from sb3_contrib import CrossQ
+from sb3_contrib.crossq.policies import CrossQPolicy
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
+from sb3_flowpolicy.common.validation import check_settings, flag, integer, number
+from sb3_flowpolicy.policies import contrib as policies
+
+_NORMALIZATION = {
+    "batch_norm": flag,
+    "batch_norm_momentum": number(0, 1),
+    "batch_norm_eps": number(0, above=True),
+    "renorm_warmup_steps": integer(0),
+}
+
+
+class CrossQFlow(OffPolicyFlow, CrossQ):
+    """CrossQ with action distributions that correlate and bend.
+
+    Everything of sb3-contrib's :class:`~sb3_contrib.CrossQ` holds, and what
+    :class:`~sb3_flowpolicy.TQCFlow` adds. Like CrossQ it takes vectors as observations, no images
+    or dictionaries.
+
+    Args:
+        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``, or a
+            policy class.
+        env: Environment, its registered id, or a ``VecEnv``.
+        *args: Further arguments of CrossQ, in its order.
+        **kwargs: Keyword arguments of CrossQ, and the two of exploration.
+
+    Raises:
+        ValueError: If an argument is out of range.
+
+    References:
+        CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).
+
+    Example:
+        >>> kwargs = dict(net_arch=[16])
+        >>> model = CrossQFlow("LowRankPolicy", "Pendulum-v1", policy_kwargs=kwargs, seed=0)
+        >>> _ = model.learn(20)
+    """
+
+    stock = CrossQ
+    policy_class_of_stock = CrossQPolicy
+    settings: ClassVar = {**SETTINGS, "policy_delay": integer(1)}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.FlowCrossQPolicy,
+        "FlowPolicy": policies.FlowCrossQPolicy,
+        "LowRankPolicy": policies.LowRankCrossQPolicy,
+        "GaussPolicy": policies.GaussCrossQPolicy,
+    }
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        check_settings(kwargs.get("policy_kwargs") or {}, _NORMALIZATION)
+        super().__init__(*args, **kwargs)

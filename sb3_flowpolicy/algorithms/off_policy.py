@@ -1,0 +1,342 @@
+"""What SACFlow, TQCFlow and CrossQFlow share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration, make_process
+from sb3_flowpolicy.algorithms.noise_process import MAX_COLOR
+from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
+from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
+from sb3_flowpolicy.checkpoint.state import Run
+from sb3_flowpolicy.common.validation import (
+    Check,
+    by_name,
+    check_policy,
+    check_settings,
+    either,
+    entropy_coefficient,
+    flag,
+    integer,
+    number,
+    optional,
+    train_frequency,
+)
+from sb3_flowpolicy.engine.replay import COLUMNS, is_plain
+from sb3_flowpolicy.guard import NonFiniteError, TrainingGuard
+from sb3_flowpolicy.guard.finite import ENVIRONMENT, check_experience, check_step
+from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.policies.off_policy import check_finite_actions
+
+SelfOffPolicyFlow = TypeVar("SelfOffPolicyFlow", bound="OffPolicyFlow")
+
+SETTINGS: dict[str, Check] = {
+    "buffer_size": integer(1),
+    "learning_starts": number(0),
+    "batch_size": integer(1),
+    "tau": number(0, 1),
+    "gamma": number(0, 1),
+    "train_freq": train_frequency,
+    "gradient_steps": integer(-1),
+    "optimize_memory_usage": flag,
+    "n_steps": integer(1),
+    "ent_coef": entropy_coefficient,
+    "target_update_interval": integer(1),
+    "target_entropy": either("auto", number()),
+    "use_sde": flag,
+    "sde_sample_freq": integer(-1),
+    "use_sde_at_warmup": flag,
+    "stats_window_size": integer(1),
+    "seed": optional(integer(0, 2**32 - 1)),
+    "action_noise_color": number(0, MAX_COLOR),
+    "action_noise_correlation_time": optional(number(0, above=True)),
+}
+"""Arguments of an off-policy algorithm that are plain values, and what they may be."""
+
+# What SB3 logs of an update. The critics come first: losses are means over several updates, which
+# do not tell which loss was the first to fail.
+_LOSSES = ("critic_loss", "ent_coef", "ent_coef_loss", "actor_loss")
+
+
+class OffPolicyFlow(OffPolicyAlgorithm):
+    """Mixin for SB3's off-policy algorithms, to be named before them.
+
+    An algorithm has a :class:`~sb3_flowpolicy.guard.TrainingGuard`, which rejects what is not
+    finite; :class:`~sb3_flowpolicy.checkpoint.RunCheckpoints` to resume from; and
+    :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`. This class passes them what
+    happens in SB3's training loop.
+
+    Args:
+        *args: Arguments of the algorithm.
+        action_noise_color: Exponent of the spectrum of the exploration noise, in [0, 1.5]: 0 is
+            white, 1 pink.
+        action_noise_correlation_time: Instead of a color, the steps after which the
+            autocorrelation of an Ornstein-Uhlenbeck process has fallen to 1/e, above 0.
+        **kwargs: Keyword arguments of the algorithm.
+
+    Raises:
+        ValueError: If an argument is out of range, or the policy belongs to another algorithm.
+    """
+
+    actor: Any
+    critic: Any
+    ent_coef_optimizer: th.optim.Adam | None
+    stock: ClassVar[type[OffPolicyAlgorithm]]
+    """The algorithm of SB3 or sb3-contrib that this one extends."""
+    policy_class_of_stock: ClassVar[type[BasePolicy]]
+    """Base class of its policies."""
+    settings: ClassVar[Mapping[str, Check]] = SETTINGS
+    """Arguments of the constructor that are plain values, and what they may be."""
+
+    def __init__(
+        self,
+        *args: Any,
+        action_noise_color: float = 0.0,
+        action_noise_correlation_time: float | None = None,
+        **kwargs: Any,
+    ) -> None:
+        given = by_name(self.stock, args, kwargs)
+        check_settings(given, self.settings)
+        check_policy(given.get("policy"), self.policy_class_of_stock, self.policy_aliases)
+        self.action_noise_color = action_noise_color
+        self.action_noise_correlation_time = action_noise_correlation_time
+        self._exploration = ColoredExploration()
+        self._guard = TrainingGuard([self])
+        self._checkpoints = RunCheckpoints(self._describe_run)
+        super().__init__(*args, **kwargs)
+
+    @classmethod
+    def resume(
+        cls: type[SelfOffPolicyFlow],
+        path: str | Path,
+        env: GymEnv | str,
+        device: th.device | str = "auto",
+    ) -> SelfOffPolicyFlow:
+        """Resume a run from its newest undamaged checkpoint.
+
+        Repeat the interrupted call of :meth:`learn` with the same arguments: it goes on to the same
+        end, and all numbers are those of a run that was not interrupted. Checkpoints contain
+        pickles: resume only those that you trust.
+
+        Args:
+            path: Folder of checkpoints.
+            env: A new environment, built and wrapped as the run's own, or its id. It takes over the
+                state of that one, the running episode included, and its ``Monitor`` file.
+            device: Where to put the networks.
+
+        Returns:
+            The model.
+
+        Raises:
+            ValueError: If the folder holds no undamaged checkpoint, or one of another algorithm, or
+                the environment does not fit.
+        """
+        store, checkpoint = open_checkpoint(path, cls.__name__)
+        venv = cls._wrap_env(maybe_make_env(env, 0))
+        model = load_agent(cls, checkpoint, "model", venv, device)
+        model._checkpoints.load(store, checkpoint)
+        return model
+
+    def learn(
+        self: SelfOffPolicyFlow,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        checkpoint_every: int | None = None,
+        checkpoint_path: str | Path | None = None,
+    ) -> SelfOffPolicyFlow:
+        """Train as in SB3, and optionally write checkpoints to resume from.
+
+        Args:
+            total_timesteps: As in SB3, as are the following.
+            callback: Called at every step.
+            log_interval: Episodes between two dumps of the log.
+            tb_log_name: Name of the TensorBoard run; default: the algorithm's.
+            reset_num_timesteps: Whether to count from zero.
+            progress_bar: Whether to show one.
+            checkpoint_every: Environment steps between two checkpoints for :meth:`resume`. Ctrl-C
+                and SIGTERM then write one, too, before they stop the program. Default: none.
+            checkpoint_path: Folder for them, empty for a new run.
+
+        Returns:
+            The model.
+
+        Raises:
+            ValueError: If only one of the last two is given, or the folder holds checkpoints of
+                another run.
+            NonFiniteError: If the environment returns, or training produces, NaN or infinity.
+        """
+        with self._checkpoints.learning(checkpoint_path, checkpoint_every):
+            super().learn(
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name or type(self).__name__,
+                reset_num_timesteps,
+                progress_bar,
+            )
+            self._guard.look()
+        return self
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Do ``gradient_steps`` updates of the algorithm's own.
+
+        Raises:
+            NonFiniteError: If a loss is not finite; weights are then as they were at most 2000
+                updates before.
+        """
+        if gradient_steps == 0:  # SB3 would log NaN, the mean of an empty list
+            return
+        self._guard.before_updates()
+        super().train(gradient_steps, batch_size)
+        logged = self.logger.name_to_value
+        losses = {f"train/{name}": logged.get(f"train/{name}", 0.0) for name in _LOSSES}
+        try:
+            self._guard.after_updates(_LOSSES, [[loss] for loss in losses.values()])
+        except NonFiniteError:
+            for name in losses:  # or the next updates would be blamed for them
+                logged.pop(name, None)
+            raise
+
+    def optimizers(self) -> dict[str, th.optim.Optimizer]:
+        """Return the optimizers by name; the entropy coefficient has one only if it is learned."""
+        found = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
+        if self.ent_coef_optimizer is not None:
+            found["ent_coef"] = self.ent_coef_optimizer
+        return found
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        make_process(self, self.n_envs, self.env)  # validates
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
+        total, reset = self._checkpoints.remaining(total_timesteps, reset_num_timesteps)
+        before = self._last_obs
+        found = super()._setup_learn(total, callback, reset, *args, **kwargs)
+        self._exploration.fit(self, self.n_envs, self.env)
+        if self._last_obs is not before:  # environments were reset
+            self._exploration.restart()
+        self._guard.restart(self._checkpoints.path)
+        normalized = self._vec_normalize_env is not None
+        first = self._last_original_obs if normalized else self._last_obs
+        check_experience({"observations": first}, self.num_timesteps, ENVIRONMENT)
+        return found
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any
+    ) -> RolloutReturn:
+        """Collect experience as SB3 does, after writing a checkpoint if one is due."""
+        if not self._checkpoints.between_rollouts({"model": callback}):
+            return RolloutReturn(0, 0, continue_training=False)
+        return super().collect_rollouts(env, callback, *args, **kwargs)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        random = self.num_timesteps < learning_starts
+        noise = None if random else self._exploration.next()
+        if noise is None:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        # As SB3 does, except that the noise is given.
+        self.policy.set_training_mode(False)
+        obs, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+        actor = self.policy.actor
+        assert isinstance(actor, FlowActor)
+        with th.no_grad():
+            scaled = actor(obs, noise=noise.to(next(actor.parameters()))).cpu().numpy()
+        return self._finish_action(scaled, action_noise, n_envs)
+
+    def _finish_action(
+        self, scaled: np.ndarray, action_noise: ActionNoise | None, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return actions for the environment and for the replay buffer."""
+        check_finite_actions(scaled)
+        scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        seen, earned = new_obs, reward
+        if self._vec_normalize_env is not None:  # which would clip infinity
+            seen, earned = self._vec_normalize_env.old_obs, self._vec_normalize_env.old_reward
+        check_step(seen, earned, dones, infos, self.num_timesteps)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._exploration.restart(dones)
+
+    def get_parameters(self) -> dict[str, dict]:
+        """Return the parameters as SB3 does, as copies that share no memory with others."""
+        return _copies(super().get_parameters())
+
+    def _describe_run(self) -> Run:
+        """Describe what a checkpoint of this model consists of."""
+        return Run(
+            kind=type(self).__name__,
+            agents={"model": self},
+            environments={"model": self.env},
+            ring=self._ring,
+            extra=self._run_state,
+            set_extra=self._load_run_state,
+        )
+
+    def _ring(self) -> tuple[RingOwner, Ring] | None:
+        buffer = self.replay_buffer
+        if buffer is None or not is_plain(buffer):
+            return None
+        columns = {name: getattr(buffer, name) for name in COLUMNS}
+        return buffer, Ring(columns, buffer.pos, buffer.full)
+
+    def _stateful_parts(self) -> dict[str, Any]:
+        """Name the parts that have a state of their own: ``state()`` and ``load_state()``."""
+        return {"exploration": self._exploration}
+
+    def _run_state(self) -> dict[str, Any]:
+        self._guard.look()  # a checkpoint is finite
+        return {name: part.state() for name, part in self._stateful_parts().items()}
+
+    def _load_run_state(self, state: dict[str, Any]) -> None:
+        for name, part in self._stateful_parts().items():
+            part.load_state(state[name])
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_guard", "_checkpoints"]
+
+
+def _copies(value: Any) -> Any:
+    """Copy tensors: views would bring the whole memory that they look at into a file."""
+    if isinstance(value, th.Tensor):
+        return value.detach().clone()
+    if isinstance(value, dict):
+        return type(value)((key, _copies(part)) for key, part in value.items())
+    return [_copies(part) for part in value] if isinstance(value, list) else value

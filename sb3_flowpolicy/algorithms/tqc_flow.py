@@ -1,0 +1,69 @@
+"""TQCFlow: sb3-contrib's TQC with our policies, colored exploration and exact resume."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from sb3_contrib import TQC
+from sb3_contrib.tqc.policies import TQCPolicy
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
+from sb3_flowpolicy.common.validation import integer
+from sb3_flowpolicy.policies import contrib as policies
+
+
+class TQCFlow(OffPolicyFlow, TQC):
+    """Truncated Quantile Critics with action distributions that correlate and bend.
+
+    Everything of sb3-contrib's :class:`~sb3_contrib.TQC` holds. ``action_noise_color`` and
+    ``action_noise_correlation_time`` make exploration directed, see
+    :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`; :meth:`learn` takes
+    ``checkpoint_every`` and ``checkpoint_path``. Updates are sb3-contrib's own: only
+    :class:`~sb3_flowpolicy.SACFlow` uses the fast engine.
+
+    Args:
+        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``,
+            their ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
+        env: Environment, its registered id, or a ``VecEnv``.
+        *args: Further arguments of TQC, in its order.
+        **kwargs: Keyword arguments of TQC, and the two of exploration.
+
+    Raises:
+        ValueError: If an argument is out of range.
+
+    References:
+        Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile
+        Critics (Kuznetsov et al., 2020).
+
+    Example:
+        >>> model = TQCFlow("FlowPolicy", "Pendulum-v1", action_noise_color=1.0, learning_starts=9)
+        >>> _ = model.learn(20)
+    """
+
+    stock = TQC
+    policy_class_of_stock = TQCPolicy
+    settings: ClassVar = {**SETTINGS, "top_quantiles_to_drop_per_net": integer(0)}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.FlowTQCPolicy,
+        "CnnPolicy": policies.CnnFlowTQCPolicy,
+        "MultiInputPolicy": policies.MultiInputFlowTQCPolicy,
+        "FlowPolicy": policies.FlowTQCPolicy,
+        "CnnFlowPolicy": policies.CnnFlowTQCPolicy,
+        "MultiInputFlowPolicy": policies.MultiInputFlowTQCPolicy,
+        "LowRankPolicy": policies.LowRankTQCPolicy,
+        "CnnLowRankPolicy": policies.CnnLowRankTQCPolicy,
+        "MultiInputLowRankPolicy": policies.MultiInputLowRankTQCPolicy,
+        "GaussPolicy": policies.GaussTQCPolicy,
+        "CnnGaussPolicy": policies.CnnGaussTQCPolicy,
+        "MultiInputGaussPolicy": policies.MultiInputGaussTQCPolicy,
+    }
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        dropped, quantiles = self.top_quantiles_to_drop_per_net, self.critic.n_quantiles
+        if dropped >= quantiles:  # nothing would be left to train on
+            raise ValueError(
+                "top_quantiles_to_drop_per_net must be less than n_quantiles of policy_kwargs, "
+                f"got {dropped} of {quantiles}"
+            )
