@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.experiment import Agent, Check, Finding
-from sb3_flowpolicy.experiments.statistics import (
+from sb3_flowpolicy.common.statistics import (
     Estimate,
     interquartile_mean,
     probability_of_improvement,
 )
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.experiment import Agent, Check, Finding
 from sb3_flowpolicy.experiments.tables import WORDS, in_digits
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from sb3_flowpolicy.experiments.curves import common_grid, on_grid, running_mean, swings
 from sb3_flowpolicy.experiments.experiment import Experiment, NotMeasuredError
 from sb3_flowpolicy.experiments.integrity import rows_of_seeds
 from sb3_flowpolicy.experiments.settings_file import read_settings
-from sb3_flowpolicy.experiments.statistics import common_grid, on_grid, running_mean, swings
 from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row
 
 # The share of evaluations, at the end of training, that "final" refers to, and the least number.

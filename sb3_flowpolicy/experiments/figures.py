@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
 from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.experiments.curves import running_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
-from sb3_flowpolicy.experiments.statistics import interquartile_curve, running_mean
 from sb3_flowpolicy.experiments.tables import WORDS
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def _draw(axes: Axes, evidence: Evidence, setting: str, agent: Agent, metric: st
     values = smoothed(values)
     shade = colour(agent)
     axes.plot(steps, values.T, color=shade, linewidth=0.5, alpha=0.35)
-    mean = interquartile_curve(values)
+    mean = bootstrap_interquartile_mean(values)
     axes.fill_between(steps, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
     axes.plot(steps, mean.value, color=shade, linewidth=2, label=agent.label)
 
@@ -151,7 +152,7 @@ def profile_figure(evidence: Evidence) -> Figure | None:
             if profile is None:
                 continue
             way, values = profile
-            mean, shade = interquartile_curve(values), colour(agent)
+            mean, shade = bootstrap_interquartile_mean(values), colour(agent)
             axes.plot(way, values.T, color=shade, linewidth=0.5, alpha=0.35)
             axes.fill_between(way, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
             axes.plot(way, mean.value, color=shade, linewidth=2, label=agent.label)

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_flowpolicy.common.statistics import interquartile_mean
 from sb3_flowpolicy.diagnostics.figures import new_figure
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.statistics import interquartile_mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

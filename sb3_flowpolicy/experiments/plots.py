@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
+from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
 from sb3_flowpolicy.experiments.figures import colour, smoothed
-from sb3_flowpolicy.experiments.statistics import interquartile_curve
 from sb3_flowpolicy.experiments.tables import WORDS
 
 
@@ -53,7 +53,7 @@ def profile_plot(evidence: Evidence, setting: str) -> go.Figure | None:
 
 
 def _add(figure: go.Figure, agent: Agent, x: np.ndarray, values: np.ndarray) -> None:
-    shade, mean = colour(agent), interquartile_curve(values)
+    shade, mean = colour(agent), bootstrap_interquartile_mean(values)
     group: dict[str, Any] = {"legendgroup": agent.name, "mode": "lines"}
     # One trace for all seeds, with gaps in between: a phone draws few traces quickly.
     figure.add_scatter(

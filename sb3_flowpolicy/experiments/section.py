@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_flowpolicy.common.statistics import RESAMPLES, RESAMPLES_OF_PAIRS
 from sb3_flowpolicy.experiments import evidence as definitions
 from sb3_flowpolicy.experiments.costs import in_words, plan_seconds
 from sb3_flowpolicy.experiments.evidence import Evidence
@@ -16,7 +17,6 @@ from sb3_flowpolicy.experiments.integrity import reservation
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
 from sb3_flowpolicy.experiments.outcomes import outcomes_figure
 from sb3_flowpolicy.experiments.policy_pictures import policies_figure
-from sb3_flowpolicy.experiments.statistics import RESAMPLES, RESAMPLES_OF_PAIRS
 from sb3_flowpolicy.experiments.tables import Table, facts, results_table
 from sb3_flowpolicy.experiments.work import make_plan
 

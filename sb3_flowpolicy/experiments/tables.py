@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from sb3_flowpolicy.common.statistics import Estimate, interquartile_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.statistics import Estimate, interquartile_mean
 from sb3_flowpolicy.experiments.work import FIRST_SEED
 
 WORDS = {

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_flowpolicy.experiments import statistics
+from sb3_flowpolicy.common import statistics
 from sb3_flowpolicy.experiments.__main__ import main
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import (

@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_flowpolicy.experiments import statistics
-from sb3_flowpolicy.experiments.statistics import (
-    common_grid,
-    interquartile_curve,
+from sb3_flowpolicy.common import statistics
+from sb3_flowpolicy.common.statistics import (
+    bootstrap_interquartile_mean,
     interquartile_mean,
-    on_grid,
     probability_of_improvement,
-    running_mean,
-    swings,
 )
 
 
@@ -28,14 +24,14 @@ def test_interquartile_mean_ignores_the_extreme_quarters() -> None:
 def test_intervals_cover_as_often_as_they_say() -> None:
     rng = np.random.default_rng(0)
     samples = rng.normal(size=(30, 400))
-    estimate = interquartile_curve(samples)
+    estimate = bootstrap_interquartile_mean(samples)
     covered = ((estimate.low < 0) & (estimate.high > 0)).mean()
     assert 0.88 < covered < 0.98
 
 
 def test_curves_and_numbers_agree() -> None:
     values = np.random.default_rng(1).normal(size=(10, 3))
-    curve = interquartile_curve(values)
+    curve = bootstrap_interquartile_mean(values)
     for k in range(3):
         number = interquartile_mean(values[:, k])
         assert number.value == pytest.approx(curve.value[k])
@@ -45,7 +41,7 @@ def test_curves_and_numbers_agree() -> None:
 
 
 def test_one_seed_has_no_interval_but_a_value() -> None:
-    curve = interquartile_curve(np.array([[1.0, 2.0]]))
+    curve = bootstrap_interquartile_mean(np.array([[1.0, 2.0]]))
     assert curve.low.tolist() == curve.value.tolist() == [1, 2]
 
 
@@ -60,37 +56,6 @@ def test_probability_of_improvement_counts_pairs() -> None:
     assert chance.value == pytest.approx(0.5)
     certain = probability_of_improvement(np.arange(10, 20.0), np.arange(10.0))
     assert (certain.value, certain.low) == (1, 1)
-
-
-def test_logs_of_unequal_length_meet_on_a_grid() -> None:
-    long, short = np.array([10.0, 20.0, 30.0, 40.0]), np.array([15.0, 25.0])
-    grid = common_grid([long, short])
-    assert grid.tolist() == [10, 15, 20, 25]
-    assert on_grid(grid, long, 2 * long).tolist() == [20, 30, 40, 50]
-    assert on_grid(grid, short, np.array([1.0, 3.0])).tolist() == [1, 1, 2, 3]
-    gap = np.array([0.0, np.nan, 4.0, 5.0])
-    assert on_grid(long, long, gap).tolist() == [0, 2, 4, 5]
-
-
-def test_running_mean_is_shorter_at_the_start() -> None:
-    assert running_mean(np.arange(5.0), 3).tolist() == [0, 0.5, 1, 2, 3]
-
-
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([0, 1, 2, 3], 0),
-        ([0, 3, 0], 1),
-        ([0, 3, 0, 3, 0], 3),
-        ([0, 3, 2.5, 3, 2.5, 3], 0),  # wiggles
-        ([3, 0, 3, 0.5], 2),
-        ([0, 1, 0.5, 1.5, 1, 3, 2, 1, 0], 1),  # a long way in small steps
-        ([5], 0),
-    ],
-)
-def test_swings_are_turns_of_full_size(values: list[float], expected: int) -> None:
-    assert swings(np.array(values, float), 2.0) == expected
-    assert swings(-np.array(values, float), 2.0) == expected
 
 
 def test_the_same_data_give_the_same_digits() -> None:

@@ -1,0 +1,76 @@
+"""Curves over training: logs on a common grid, smoothed, and how often they swing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def common_grid(steps: Sequence[np.ndarray]) -> np.ndarray:
+    """Return all steps at which any seed was measured, up to where the shortest log ends.
+
+    Example:
+        >>> common_grid([np.array([1, 2, 3]), np.array([2, 4])]).tolist()
+        [1, 2, 3]
+    """
+    last = min(one[-1] for one in steps)
+    grid = np.unique(np.concatenate(list(steps)))
+    return grid[grid <= last]
+
+
+def on_grid(grid: np.ndarray, steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate a log linearly; before its first value it is taken to be constant.
+
+    Args:
+        grid: Where values are wanted, (T,).
+        steps: Where values were measured, increasing.
+        values: What was measured; NaN where nothing was, but not everywhere.
+
+    Returns:
+        Values at the grid, (T,).
+    """
+    known = np.isfinite(values)
+    return np.interp(grid, steps[known], values[known])
+
+
+def running_mean(values: np.ndarray, window: int) -> np.ndarray:
+    """Average each value with up to ``window - 1`` before it, along the last axis.
+
+    Example:
+        >>> running_mean(np.array([0.0, 1.0, 1.0]), 2).tolist()
+        [0.0, 0.5, 1.0]
+    """
+    sums = np.cumsum(values, axis=-1)
+    sums[..., window:] -= sums[..., :-window].copy()
+    return sums / np.minimum(np.arange(values.shape[-1]) + 1, window)
+
+
+def swings(values: np.ndarray, amplitude: float) -> int:
+    """Count how often a curve turns round after moving at least ``amplitude`` one way.
+
+    Small wiggles do not count: a turn is one only if the curve has moved by ``amplitude`` one way
+    and then moves by ``amplitude`` the other way. A monotonic curve has none, a square wave over
+    three periods five.
+
+    Args:
+        values: The curve, (T,).
+        amplitude: Least difference between a high and the low that follows, above 0.
+
+    Example:
+        >>> swings(np.array([0.0, 1.0, 0.1, 0.2, 0.9, 0.0]), 0.5)
+        3
+        >>> swings(np.linspace(0, 9, 50), 1.5)
+        0
+    """
+    low = high = values[0]
+    direction, turns = 0, 0
+    for value in values[1:]:
+        low, high = min(low, value), max(high, value)
+        if direction >= 0 and high - value >= amplitude:
+            turns += direction
+            direction, low = -1, value
+        elif direction <= 0 and value - low >= amplitude:
+            turns -= direction
+            direction, high = 1, value
+    return turns
