@@ -22,7 +22,7 @@ from sb3_flowpolicy.common.settings import (
     integer,
     number,
 )
-from sb3_flowpolicy.policies import contrib as policies
+from sb3_flowpolicy.policies import crossq, tqc
 
 _POLICY_BASES = {TQC: TQCPolicy, CrossQ: CrossQPolicy}
 
@@ -81,20 +81,7 @@ class TQCFlow(_Checked, TQC):
         >>> _ = model.learn(20)
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowTQCPolicy,
-        "CnnPolicy": policies.CnnFlowTQCPolicy,
-        "MultiInputPolicy": policies.MultiInputFlowTQCPolicy,
-        "FlowPolicy": policies.FlowTQCPolicy,
-        "CnnFlowPolicy": policies.CnnFlowTQCPolicy,
-        "MultiInputFlowPolicy": policies.MultiInputFlowTQCPolicy,
-        "LowRankPolicy": policies.LowRankTQCPolicy,
-        "CnnLowRankPolicy": policies.CnnLowRankTQCPolicy,
-        "MultiInputLowRankPolicy": policies.MultiInputLowRankTQCPolicy,
-        "GaussPolicy": policies.GaussTQCPolicy,
-        "CnnGaussPolicy": policies.CnnGaussTQCPolicy,
-        "MultiInputGaussPolicy": policies.MultiInputGaussTQCPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = tqc.ALIASES
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -132,9 +119,4 @@ class CrossQFlow(_Checked, CrossQ):
         >>> _ = model.learn(20)
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowCrossQPolicy,
-        "FlowPolicy": policies.FlowCrossQPolicy,
-        "LowRankPolicy": policies.LowRankCrossQPolicy,
-        "GaussPolicy": policies.GaussCrossQPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = crossq.ALIASES

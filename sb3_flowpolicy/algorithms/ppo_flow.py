@@ -17,7 +17,7 @@ from sb3_flowpolicy.common.settings import (
     check_settings,
 )
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
-from sb3_flowpolicy.policies import on_policy as policies
+from sb3_flowpolicy.policies import on_policy
 
 _COLORED = ("action_noise_color", "action_noise_correlation_time")
 
@@ -45,17 +45,7 @@ class PPOFlow(PPO):
         >>> model = PPOFlow("FlowPolicy", "Pendulum-v1", n_steps=64, seed=0).learn(64)
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowActorCriticPolicy,
-        "CnnPolicy": policies.CnnFlowActorCriticPolicy,
-        "MultiInputPolicy": policies.MultiInputFlowActorCriticPolicy,
-        "FlowPolicy": policies.FlowActorCriticPolicy,
-        "CnnFlowPolicy": policies.CnnFlowActorCriticPolicy,
-        "MultiInputFlowPolicy": policies.MultiInputFlowActorCriticPolicy,
-        "LowRankPolicy": policies.LowRankActorCriticPolicy,
-        "CnnLowRankPolicy": policies.CnnLowRankActorCriticPolicy,
-        "MultiInputLowRankPolicy": policies.MultiInputLowRankActorCriticPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = on_policy.ALIASES
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         given = by_name(PPO, args, kwargs)

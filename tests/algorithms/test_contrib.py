@@ -184,7 +184,7 @@ def test_loading_ppo_takes_no_coloured_noise(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow, CrossQFlow, PPOFlow])
 def test_policies_of_other_observations(algorithm: Any) -> None:
-    with pytest.raises(ValueError, match=r"observation_space must be no Dict .* MultiInput"):
+    with pytest.raises(ValueError, match=r"observation_space must not be a Dict .* MultiInput"):
         algorithm("FlowPolicy", SimpleMultiObsEnv(discrete_actions=False))
     if algorithm is not CrossQFlow:
         with pytest.raises(ValueError, match="observation_space must be a Dict for Combined"):
