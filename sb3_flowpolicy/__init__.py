@@ -1,4 +1,4 @@
-"""Soft Actor-Critic policies that correlate and bend their action distribution.
+"""Reinforcement learning with low-rank and normalizing-flow policies, for Stable-Baselines3.
 
 Public names are resolved on first use, so that importing the package stays cheap.
 """
@@ -8,137 +8,66 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from sb3_flowpolicy.algorithms.crossq_flow import CrossQFlow
-    from sb3_flowpolicy.algorithms.ppo_flow import PPOFlow
-    from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-    from sb3_flowpolicy.algorithms.tqc_flow import TQCFlow
-    from sb3_flowpolicy.bundle import BundleError
-    from sb3_flowpolicy.checkpoint import RunCheckpointCallback, has_checkpoint
-    from sb3_flowpolicy.distributions import ActionDistribution, register_distribution
-    from sb3_flowpolicy.export import export_onnx
-    from sb3_flowpolicy.guard.finite import NonFiniteError
-    from sb3_flowpolicy.policies import (
-        CnnFlowPolicy,
-        CnnGaussPolicy,
-        CnnLowRankPolicy,
-        FlowPolicy,
-        GaussPolicy,
-        LowRankPolicy,
-        MultiInputFlowPolicy,
-        MultiInputGaussPolicy,
-        MultiInputLowRankPolicy,
-    )
-    from sb3_flowpolicy.policies.contrib import (
-        CnnFlowTQCPolicy,
-        CnnGaussTQCPolicy,
-        CnnLowRankTQCPolicy,
-        FlowCrossQPolicy,
-        FlowTQCPolicy,
-        GaussCrossQPolicy,
-        GaussTQCPolicy,
-        LowRankCrossQPolicy,
-        LowRankTQCPolicy,
-        MultiInputFlowTQCPolicy,
-        MultiInputGaussTQCPolicy,
-        MultiInputLowRankTQCPolicy,
-    )
+if TYPE_CHECKING:  # the names of _MODULES once more, for type checkers and editors
+    from sb3_flowpolicy.algorithms.crossq_flow import CrossQFlow as CrossQFlow
+    from sb3_flowpolicy.algorithms.ppo_flow import PPOFlow as PPOFlow
+    from sb3_flowpolicy.algorithms.sac_flow import SACFlow as SACFlow
+    from sb3_flowpolicy.algorithms.tqc_flow import TQCFlow as TQCFlow
+    from sb3_flowpolicy.bundle import BundleError as BundleError
+    from sb3_flowpolicy.checkpoint import RunCheckpointCallback as RunCheckpointCallback
+    from sb3_flowpolicy.checkpoint import has_checkpoint as has_checkpoint
+    from sb3_flowpolicy.distributions import ActionDistribution as ActionDistribution
+    from sb3_flowpolicy.distributions import register_distribution as register_distribution
+    from sb3_flowpolicy.export import export_onnx as export_onnx
+    from sb3_flowpolicy.guard import NonFiniteError as NonFiniteError
+    from sb3_flowpolicy.policies.crossq import FlowCrossQPolicy as FlowCrossQPolicy
+    from sb3_flowpolicy.policies.on_policy import FlowActorCriticPolicy as FlowActorCriticPolicy
     from sb3_flowpolicy.policies.on_policy import (
-        CnnFlowActorCriticPolicy,
-        CnnLowRankActorCriticPolicy,
-        FlowActorCriticPolicy,
-        LowRankActorCriticPolicy,
-        MultiInputFlowActorCriticPolicy,
-        MultiInputLowRankActorCriticPolicy,
+        LowRankActorCriticPolicy as LowRankActorCriticPolicy,
     )
-    from sb3_flowpolicy.seeds.batch import SeedBatch
+    from sb3_flowpolicy.policies.sac import CnnFlowPolicy as CnnFlowPolicy
+    from sb3_flowpolicy.policies.sac import FlowPolicy as FlowPolicy
+    from sb3_flowpolicy.policies.sac import GaussPolicy as GaussPolicy
+    from sb3_flowpolicy.policies.sac import LowRankPolicy as LowRankPolicy
+    from sb3_flowpolicy.policies.sac import MultiInputFlowPolicy as MultiInputFlowPolicy
+    from sb3_flowpolicy.policies.tqc import FlowTQCPolicy as FlowTQCPolicy
+    from sb3_flowpolicy.seeds.batch import SeedBatch as SeedBatch
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "ActionDistribution",
-    "BundleError",
-    "CnnFlowActorCriticPolicy",
-    "CnnFlowPolicy",
-    "CnnFlowTQCPolicy",
-    "CnnGaussPolicy",
-    "CnnGaussTQCPolicy",
-    "CnnLowRankActorCriticPolicy",
-    "CnnLowRankPolicy",
-    "CnnLowRankTQCPolicy",
-    "CrossQFlow",
-    "FlowActorCriticPolicy",
-    "FlowCrossQPolicy",
-    "FlowPolicy",
-    "FlowTQCPolicy",
-    "GaussCrossQPolicy",
-    "GaussPolicy",
-    "GaussTQCPolicy",
-    "LowRankActorCriticPolicy",
-    "LowRankCrossQPolicy",
-    "LowRankPolicy",
-    "LowRankTQCPolicy",
-    "MultiInputFlowActorCriticPolicy",
-    "MultiInputFlowPolicy",
-    "MultiInputFlowTQCPolicy",
-    "MultiInputGaussPolicy",
-    "MultiInputGaussTQCPolicy",
-    "MultiInputLowRankActorCriticPolicy",
-    "MultiInputLowRankPolicy",
-    "MultiInputLowRankTQCPolicy",
-    "NonFiniteError",
-    "PPOFlow",
-    "RunCheckpointCallback",
-    "SACFlow",
-    "SeedBatch",
-    "TQCFlow",
-    "export_onnx",
-    "has_checkpoint",
-    "register_distribution",
-]
-
-_ELSEWHERE = {
-    "ActionDistribution": "distributions",
-    "BundleError": "bundle",
-    "CnnFlowActorCriticPolicy": "policies.on_policy",
-    "CnnFlowTQCPolicy": "policies.contrib",
-    "CnnGaussTQCPolicy": "policies.contrib",
-    "CnnLowRankActorCriticPolicy": "policies.on_policy",
-    "CnnLowRankTQCPolicy": "policies.contrib",
+_MODULES = {
     "CrossQFlow": "algorithms.crossq_flow",
-    "FlowActorCriticPolicy": "policies.on_policy",
-    "FlowCrossQPolicy": "policies.contrib",
-    "FlowTQCPolicy": "policies.contrib",
-    "GaussCrossQPolicy": "policies.contrib",
-    "GaussTQCPolicy": "policies.contrib",
-    "LowRankActorCriticPolicy": "policies.on_policy",
-    "LowRankCrossQPolicy": "policies.contrib",
-    "LowRankTQCPolicy": "policies.contrib",
-    "MultiInputFlowActorCriticPolicy": "policies.on_policy",
-    "MultiInputFlowTQCPolicy": "policies.contrib",
-    "MultiInputGaussTQCPolicy": "policies.contrib",
-    "MultiInputLowRankActorCriticPolicy": "policies.on_policy",
-    "MultiInputLowRankTQCPolicy": "policies.contrib",
-    "NonFiniteError": "guard",
-    "PPOFlow": "algorithms.ppo_flow",
-    "RunCheckpointCallback": "checkpoint",
-    "SACFlow": "algorithms.sac_flow",
-    "SeedBatch": "seeds.batch",
     "TQCFlow": "algorithms.tqc_flow",
-    "export_onnx": "export",
+    "PPOFlow": "algorithms.ppo_flow",
+    "SACFlow": "algorithms.sac_flow",
+    "BundleError": "bundle",
+    "RunCheckpointCallback": "checkpoint",
     "has_checkpoint": "checkpoint",
+    "ActionDistribution": "distributions",
     "register_distribution": "distributions",
+    "export_onnx": "export",
+    "NonFiniteError": "guard",
+    "FlowCrossQPolicy": "policies.crossq",
+    "FlowActorCriticPolicy": "policies.on_policy",
+    "LowRankActorCriticPolicy": "policies.on_policy",
+    "CnnFlowPolicy": "policies.sac",
+    "FlowPolicy": "policies.sac",
+    "GaussPolicy": "policies.sac",
+    "LowRankPolicy": "policies.sac",
+    "MultiInputFlowPolicy": "policies.sac",
+    "FlowTQCPolicy": "policies.tqc",
+    "SeedBatch": "seeds.batch",
 }
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = import_module(f"{__name__}.{_ELSEWHERE.get(name, 'policies')}")
-    value = getattr(module, name)
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_MODULES})

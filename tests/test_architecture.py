@@ -1,4 +1,4 @@
-"""The floors of the house: each package imports only what stands below it."""
+"""The layers of the package: each imports only from those below it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-# From the ground up. A package may import those before it, and nothing after.
+# From bottom to top. A package may import only from those before it.
 LIBRARY = [
     "common",
     "guard",
@@ -96,5 +96,10 @@ def test_public_names_resolve() -> None:
     for name in sb3_flowpolicy.__all__:
         assert getattr(sb3_flowpolicy, name).__name__ == name
     assert set(sb3_flowpolicy.__all__) <= set(dir(sb3_flowpolicy))
+    # Type checkers see the same names.
+    modules = sb3_flowpolicy._MODULES.items()
+    expected = {f"sb3_flowpolicy.{module}.{name}" for name, module in modules}
+    found = imports(ROOT / "sb3_flowpolicy" / "__init__.py")
+    assert {name for name in found if name.startswith("sb3_flowpolicy.")} == expected
     with pytest.raises(AttributeError, match="has no attribute 'NoPolicy'"):
         sb3_flowpolicy.NoPolicy  # noqa: B018

@@ -1,7 +1,7 @@
 """Gymnasium environments that need correlated exploration.
 
-Importing this package registers the environments and nothing else: the compiled code and the
-renderer are loaded when the first environment is made.
+Importing this package only registers the environments. The compiled code and the renderer are
+loaded when the first environment is made.
 
 Example:
     >>> import gymnasium as gym
@@ -12,47 +12,37 @@ Example:
     (array([0., 0.], dtype=float32), {'is_success': False})
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from flowpolicy_envs.registration import register_envs
 
-if TYPE_CHECKING:
-    from flowpolicy_envs.square.env import SquareEnv
-    from flowpolicy_envs.square.holder import Holder
-    from flowpolicy_envs.square.tasks import FindGoal, Hold, Move, MoveX
-    from flowpolicy_envs.square.vector import SquareVectorEnv
-    from flowpolicy_envs.tunnel.env import TunnelEnv
-    from flowpolicy_envs.tunnel.vector import TunnelVectorEnv
+if TYPE_CHECKING:  # the names of _MODULES once more, for type checkers and editors
+    from flowpolicy_envs.square.env import SquareEnv as SquareEnv
+    from flowpolicy_envs.square.holder import Holder as Holder
+    from flowpolicy_envs.square.tasks import FindGoal as FindGoal
+    from flowpolicy_envs.square.tasks import Hold as Hold
+    from flowpolicy_envs.square.tasks import Move as Move
+    from flowpolicy_envs.square.tasks import MoveX as MoveX
+    from flowpolicy_envs.square.vector import SquareVectorEnv as SquareVectorEnv
+    from flowpolicy_envs.tunnel.env import TunnelEnv as TunnelEnv
+    from flowpolicy_envs.tunnel.vector import TunnelVectorEnv as TunnelVectorEnv
 
-__all__ = [
-    "FindGoal",
-    "Hold",
-    "Holder",
-    "Move",
-    "MoveX",
-    "SquareEnv",
-    "SquareVectorEnv",
-    "TunnelEnv",
-    "TunnelVectorEnv",
-    "register_envs",
-]
-
-_LAZY = {
-    **dict.fromkeys(("FindGoal", "Hold", "Move", "MoveX"), "flowpolicy_envs.square.tasks"),
-    "Holder": "flowpolicy_envs.square.holder",
-    "SquareEnv": "flowpolicy_envs.square.env",
-    "SquareVectorEnv": "flowpolicy_envs.square.vector",
-    "TunnelEnv": "flowpolicy_envs.tunnel.env",
-    "TunnelVectorEnv": "flowpolicy_envs.tunnel.vector",
+_MODULES = {
+    **dict.fromkeys(("FindGoal", "Hold", "Move", "MoveX"), "square.tasks"),
+    "Holder": "square.holder",
+    "SquareEnv": "square.env",
+    "SquareVectorEnv": "square.vector",
+    "TunnelEnv": "tunnel.env",
+    "TunnelVectorEnv": "tunnel.vector",
 }
+__all__ = sorted([*_MODULES, "register_envs"])
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(_LAZY[name]), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 register_envs()

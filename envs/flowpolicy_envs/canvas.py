@@ -1,4 +1,4 @@
-"""What the pictures of all environments have in common: paper, window, scale and smooth edges."""
+"""What the pictures of all environments have in common: background, window, scale, smooth edges."""
 
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -17,7 +17,7 @@ RENDER_FPS = 10
 WHITE = (255, 255, 255)
 
 _SUPERSAMPLING = 3
-"""Shapes are drawn this much larger and scaled down, which smooths their edges."""
+"""Pictures are drawn this much larger and scaled down, which smooths the edges."""
 
 
 def check_render_mode(render_mode: str | None, modes: tuple[str, ...]) -> None:
@@ -27,9 +27,10 @@ def check_render_mode(render_mode: str | None, modes: tuple[str, ...]) -> None:
 
 
 class Canvas(ABC):
-    """A square picture of the world [-view, view]^2, to look at or as an array.
+    """A square picture of the world [-view, view]^2, in a window or as an array.
 
-    A subclass draws what does not move once, in `_draw_background`, and the rest in `_draw`.
+    A subclass draws the static part in `_draw_background`, which is called once, and the rest in
+    `_draw`.
 
     Args:
         size: Edge of a frame in pixels, at least 16.
@@ -54,26 +55,26 @@ class Canvas(ABC):
         self._clock: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # Surfaces and windows can neither be copied nor pickled; they are drawn again on demand.
+        # Surfaces and windows can be neither copied nor pickled. They are created on demand.
         return {**self.__dict__, "_background": None, "_window": None, "_clock": None}
 
     @abstractmethod
     def _draw_background(self, canvas: "pygame.Surface") -> None:
-        """Draw all that does not move on white paper."""
+        """Draw the static part on a white canvas."""
 
     @abstractmethod
     def _draw(self, canvas: "pygame.Surface", *scene: Any) -> None:
         """Draw the scene over the background."""
 
     def frame(self, *scene: Any) -> NDArray[np.uint8]:
-        """Return the picture of the scene: colours (size, size, 3), 0 to 255."""
+        """Return the picture of the scene: RGB values (size, size, 3), 0 to 255."""
         import pygame
 
         pixels = pygame.surfarray.array3d(self._picture(scene))
         return np.ascontiguousarray(pixels.transpose(1, 0, 2))
 
     def show(self, *scene: Any) -> None:
-        """Show the picture in a window, and wait as the frame rate asks for."""
+        """Show the picture in a window at the frame rate."""
         import pygame
 
         if self._window is None:
@@ -98,7 +99,7 @@ class Canvas(ABC):
         import pygame
 
         if self._background is None:
-            # A depth of 32 bits is given so that no display has to be asked for its own.
+            # Without an explicit depth pygame would ask the display for it.
             self._background = pygame.Surface((self._edge, self._edge), 0, 32)
             self._background.fill(WHITE)
             self._draw_background(self._background)
@@ -109,7 +110,7 @@ class Canvas(ABC):
     def _dots(
         self,
         canvas: "pygame.Surface",
-        colour: tuple[int, int, int, int],
+        color: tuple[int, int, int, int],
         radius: float,
         positions: NDArray[np.float64],
     ) -> None:
@@ -118,7 +119,7 @@ class Canvas(ABC):
 
         pixels = self._pixels(radius)
         dot = pygame.Surface((2 * pixels + 1, 2 * pixels + 1), pygame.SRCALPHA, 32)
-        pygame.draw.circle(dot, colour, (pixels, pixels), pixels)
+        pygame.draw.circle(dot, color, (pixels, pixels), pixels)
         corners = self._screen(positions) - pixels
         canvas.blits([(dot, corner) for corner in corners.tolist()])
 

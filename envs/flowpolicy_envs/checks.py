@@ -1,4 +1,4 @@
-"""What arguments have to be, whatever they come as: from Python, from YAML, from anywhere."""
+"""Checks of arguments, which may come from Python, YAML or elsewhere."""
 
 import math
 import numbers
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def is_number(value: Any) -> bool:
-    """Whether this is one real number that floats can hold, neither a boolean nor an array."""
+    """Whether this is a real number in the range of floats, neither a boolean nor an array."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         return False
     try:
@@ -17,7 +17,7 @@ def is_number(value: Any) -> bool:
 
 
 def is_whole(value: Any) -> bool:
-    """Whether this is one integer that arrays can be as long as, and no boolean."""
+    """Whether this is an integer small enough for the size of an array, and not a boolean."""
     whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     return whole and abs(value) < 2**31
 

@@ -1,4 +1,4 @@
-"""Which environment ids there are, and what distinguishes them."""
+"""The environment ids and their arguments."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ _LINE_REACH = 0.14
 """Seven steps of 0.14 reach 0.9 from the origin (0.98), six do not (0.84)."""
 
 _CURVED_REACH = 0.21
-"""On the default circle this makes six steps the fewest that reach the goal; see TunnelEnv."""
+"""With this reach at least six steps lead to the goal of the default circle; see TunnelEnv."""
 
 _SPARSE: dict[str, Any] = {
     "path": "line",
@@ -37,13 +37,13 @@ TUNNEL_IDS: dict[str, dict[str, Any]] = {
     "TunnelDiagonal-v0": {**_SPARSE, "total_dims": 2, "coupled_dims": 2},
     "TunnelSpline-v0": {**_DENSE, "path": "spline", "goal_reward": 1.0},
 }
-"""Each Tunnel id and the constructor arguments in which it differs from `Tunnel-v0`."""
+"""The Tunnel ids and the arguments in which they differ from `Tunnel-v0`."""
 
 _MAX_EPISODE_STEPS = {"TunnelSpline-v0": 60}
-"""The spline is three times as long as the circle's way, so 40 steps would leave little slack."""
+"""The spline is three times as long as the way along the circle: 40 steps would be tight."""
 
 _MOVE: dict[str, Any] = {"max_force": 1.95, "warm_up": 4.0}
-"""Four fingers at 1.95 N press with 7.8 N, three with 5.85 N; the weight of 3 N demands 6 N."""
+"""The weight of 3 N requires 6 N: four fingers of 1.95 N exert 7.8 N, three only 5.85 N."""
 
 SQUARE_IDS: dict[str, dict[str, Any]] = {
     "Square-v0": {},
@@ -52,7 +52,7 @@ SQUARE_IDS: dict[str, dict[str, Any]] = {
     "SquareMoveX-v0": {**_MOVE, "task": "move_x"},
     "SquareFindGoal-v0": {**_MOVE, "task": "find_goal"},
 }
-"""Each Square id and the constructor arguments in which it differs from `Square-v0`."""
+"""The Square ids and the arguments in which they differ from `Square-v0`."""
 
 _SQUARE_STEPS = {"Square-v0": 40, "SquareHold-v0": 40}
 
@@ -60,8 +60,8 @@ _SQUARE_STEPS = {"Square-v0": 40, "SquareHold-v0": 40}
 def register_envs() -> None:
     """Register every environment of this package with gymnasium.
 
-    Ids that are registered already are left alone, so calling this again (gymnasium does when it
-    loads plugins) neither warns nor undoes a user's own registration.
+    Ids that are already registered are skipped, so calling this again (as gymnasium does when it
+    loads plugins) neither warns nor overwrites a user's own registration.
 
     Example:
         >>> import gymnasium as gym

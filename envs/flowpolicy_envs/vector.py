@@ -1,49 +1,40 @@
-"""What the vectorised environments have in common: seeds, time limits, resets and infos."""
+"""What the vectorized environments have in common: seeds, time limits, resets and infos."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from flowpolicy_envs.canvas import RENDER_FPS, check_render_mode
+from flowpolicy_envs.canvas import Canvas, check_render_mode
+from flowpolicy_envs.checks import is_whole
+from flowpolicy_envs.env import Batch, BoolArray, Config
 
-BoolArray = NDArray[np.bool_]
 StepResult = tuple[NDArray[np.float32], NDArray[np.float64], BoolArray, BoolArray, dict[str, Any]]
-
-
-class Batch(Protocol):
-    """The state of N agents. Each call of `step` overwrites the arrays (N, ...)."""
-
-    observations: NDArray[np.float32]
-    rewards: NDArray[np.float64]
-    terminated: BoolArray
-
-    def infos(self) -> dict[str, NDArray[Any]]:
-        """Return new arrays (N,): what each agent's `info` holds."""
 
 
 class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndarray]):
     """N agents of the same kind, each with its own random generator.
 
-    A subclass says how agents begin an episode, how they step, and what they look like.
+    Agent i behaves like a single environment that is reset with agent i's seed, and the whole like
+    gymnasium's `SyncVectorEnv` over N of them, `infos` included, only faster.
 
     Args:
-        batch: The agents' state.
-        observation_space: Of one agent.
-        action_space: Of one agent.
         num_envs: Number of agents N, at least 1.
         max_episode_steps: Steps after which an episode is truncated, at least 1, or None for
-            never.
-        autoreset_mode: What follows an episode's end.
+            no limit. `gymnasium.make_vec` takes it from the registration.
+        autoreset_mode: What follows the end of an episode. With "NextStep" the next call of `step`
+            ignores the action and resets. With "SameStep" the agent is reset at once, and
+            `infos["final_obs"]` and `infos["final_info"]` describe the end of the episode. With
+            "Disabled" the caller has to reset.
         render_mode: None or "rgb_array".
-        render_fps: Frames per second at which pictures show real time.
+        render_size: Edge of each agent's frame in pixels, at least 16.
+        **arguments: The arguments of the single environment.
 
     Raises:
         ValueError: If an argument is outside of its range; the message names it.
@@ -51,33 +42,32 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
 
     def __init__(
         self,
-        batch: Batch,
-        observation_space: spaces.Box,
-        action_space: spaces.Box,
+        num_envs: int = 1,
         *,
-        num_envs: int,
-        max_episode_steps: int | None,
-        autoreset_mode: str | AutoresetMode,
-        render_mode: str | None,
-        render_fps: int = RENDER_FPS,
+        max_episode_steps: int | None = 40,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        render_size: int = 600,
+        **arguments: Any,
     ) -> None:
+        if not is_whole(num_envs) or num_envs < 1:
+            raise ValueError(f"num_envs must be an integer of at least 1, got {num_envs!r}")
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be None or >= 1, got {max_episode_steps}")
         check_render_mode(render_mode, ("rgb_array",))
+        config, self._agents, self._renderer = self._build(num_envs, render_size, **arguments)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
-            "render_fps": render_fps,
+            "render_fps": self._renderer.fps,
             "autoreset_mode": self.autoreset_mode,
         }
-        self.single_observation_space = observation_space
-        self.single_action_space = action_space
-        self.observation_space = batch_space(observation_space, num_envs)
-        self.action_space = batch_space(action_space, num_envs)
-        self._agents = batch
-        self._everyone = np.ones(num_envs, np.bool_)
+        self.single_observation_space = config.observation_space
+        self.single_action_space = config.action_space
+        self.observation_space = batch_space(config.observation_space, num_envs)
+        self.action_space = batch_space(config.action_space, num_envs)
         self._limit = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
@@ -85,16 +75,12 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         self._generators: list[np.random.Generator | None] = [None] * num_envs
 
     @abstractmethod
-    def _begin(self, chosen: BoolArray) -> None:
-        """Put the `chosen` (N,) agents at the start of a new episode."""
+    def _build(self, count: int, size: int, **arguments: Any) -> tuple[Config, Batch, Canvas]:
+        """Build configuration, state and renderer of `count` agents."""
 
     @abstractmethod
-    def _advance(self, actions: ArrayLike, active: BoolArray | None) -> None:
-        """Step the `active` (N,) agents, None for all."""
-
-    @abstractmethod
-    def _frame(self, i: int) -> NDArray[np.uint8]:
-        """Return agent i's picture."""
+    def _scene(self, i: int) -> tuple[Any, ...]:
+        """Return the arguments of the renderer for agent i."""
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -104,7 +90,7 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
         """The seeds of the agents' random generators."""
-        self.np_random  # noqa: B018 (makes those that do not exist yet)
+        self.np_random  # noqa: B018 (creates the missing ones)
         return tuple(self._seeds)
 
     def reset(
@@ -116,13 +102,13 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         """Start new episodes.
 
         Args:
-            seed: One seed per agent, or an integer s for s, s + 1, ..., or None to go on with
-                the generators as they are.
-            options: `{"reset_mask": mask}` restricts the reset to the agents in the boolean
-                `mask` (N,), as "Disabled" needs it.
+            seed: One seed per agent, or an integer s for s, s + 1, ..., or None to keep the
+                generators.
+            options: `{"reset_mask": mask}` resets only the agents in the boolean `mask` (N,), for
+                the mode "Disabled".
 
         Raises:
-            ValueError: If the number of seeds or the mask does not fit the number of agents.
+            ValueError: If there are not N seeds or the mask has another shape.
         """
         seeds = self._checked_seeds(seed)
         chosen = self._checked_mask((options or {}).get("reset_mask"))
@@ -133,7 +119,7 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         return self._agents.observations.copy(), _masked(self._agents.infos(), chosen)
 
     def step(self, actions: ArrayLike) -> StepResult:
-        """Move every agent by its action, and reset as `autoreset_mode` says.
+        """Step every agent with its action, and reset according to `autoreset_mode`.
 
         Args:
             actions: Actions (N, D); clipped to [-1, 1].
@@ -147,15 +133,15 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         """
         agents, mode = self._agents, self.autoreset_mode
         ended = self._ended
-        anyone_ended = bool(ended.any())
-        if anyone_ended and mode is AutoresetMode.DISABLED:
+        some_ended = bool(ended.any())
+        if some_ended and mode is AutoresetMode.DISABLED:
             raise ResetNeeded(
                 f"autoreset_mode is Disabled, so agents {np.flatnonzero(ended).tolist()} must be "
                 f"reset before the next step"
             )
-        self._advance(actions, ~ended if anyone_ended else None)
+        agents.step(actions, ~ended if some_ended else None, self._generator)
         self._steps += 1
-        if anyone_ended:
+        if some_ended:
             self._restart(ended)
         rewards, terminated = agents.rewards.copy(), agents.terminated.copy()
         truncated = self._steps >= self._limit
@@ -164,22 +150,22 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         if mode is AutoresetMode.SAME_STEP and self._ended.any():
             final = self._final_infos(self._ended)
             self._restart(self._ended)
-        infos = {**final, **_masked(agents.infos(), self._everyone)}
+        infos = {**final, **_masked(agents.infos(), agents.everyone)}
         return agents.observations.copy(), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a frame (render_size, render_size, 3) per agent."""
         if self.render_mode is None:
             return None
-        return tuple(self._frame(i) for i in range(self.num_envs))
+        return tuple(self._renderer.frame(*self._scene(i)) for i in range(self.num_envs))
 
     def _restart(self, chosen: BoolArray) -> None:
-        self._begin(chosen)
+        self._agents.reset(chosen, self._generator)
         self._steps[chosen] = 0
         self._ended[chosen] = False
 
     def _final_infos(self, ended: BoolArray) -> dict[str, Any]:
-        """Describe how episodes ended, the way `SyncVectorEnv` does."""
+        """Describe how episodes ended, in the format of `SyncVectorEnv`."""
         final_obs = np.full(self.num_envs, None, dtype=object)
         observations = self._agents.observations.copy()
         for i in np.flatnonzero(ended).tolist():
@@ -209,7 +195,7 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
 
     def _checked_mask(self, mask: Any) -> BoolArray:
         if mask is None:
-            return self._everyone
+            return self._agents.everyone
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(
@@ -219,15 +205,8 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         return mask
 
 
-def check_num_envs(num_envs: int) -> int:
-    """Return `num_envs`, or raise ValueError if it is no number of agents."""
-    if not isinstance(num_envs, int | np.integer) or num_envs < 1:
-        raise ValueError(f"num_envs must be an integer of at least 1, got {num_envs!r}")
-    return int(num_envs)
-
-
 def _masked(infos: dict[str, NDArray[Any]], mask: BoolArray) -> dict[str, Any]:
-    """Pair each array with `mask` under its name with an underscore, and blank out the rest."""
+    """Add `mask` as `_name` to each array `name`, and clear the entries outside the mask."""
     masked: dict[str, Any] = {}
     blank = None if mask.all() else ~mask
     for name, values in infos.items():

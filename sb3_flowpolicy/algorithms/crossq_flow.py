@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.common.validation import check_settings, flag, integer, number
-from sb3_flowpolicy.policies import contrib as policies
+from sb3_flowpolicy.policies import crossq
 
 _NORMALIZATION = {
     "batch_norm": flag,
@@ -49,12 +49,7 @@ class CrossQFlow(OffPolicyFlow, CrossQ):
     stock = CrossQ
     policy_class_of_stock = CrossQPolicy
     settings: ClassVar = {**SETTINGS, "policy_delay": integer(1)}
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowCrossQPolicy,
-        "FlowPolicy": policies.FlowCrossQPolicy,
-        "LowRankPolicy": policies.LowRankCrossQPolicy,
-        "GaussPolicy": policies.GaussCrossQPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = crossq.ALIASES
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         check_settings(kwargs.get("policy_kwargs") or {}, _NORMALIZATION)

@@ -21,7 +21,7 @@ from sb3_flowpolicy.common.validation import (
     or_schedule,
 )
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
-from sb3_flowpolicy.policies import on_policy as policies
+from sb3_flowpolicy.policies import on_policy
 
 _SETTINGS: dict[str, Check] = {
     "n_steps": integer(1),
@@ -64,17 +64,7 @@ class PPOFlow(PPO):
         >>> model = PPOFlow("FlowPolicy", "Pendulum-v1", n_steps=64, seed=0).learn(64)
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowActorCriticPolicy,
-        "CnnPolicy": policies.CnnFlowActorCriticPolicy,
-        "MultiInputPolicy": policies.MultiInputFlowActorCriticPolicy,
-        "FlowPolicy": policies.FlowActorCriticPolicy,
-        "CnnFlowPolicy": policies.CnnFlowActorCriticPolicy,
-        "MultiInputFlowPolicy": policies.MultiInputFlowActorCriticPolicy,
-        "LowRankPolicy": policies.LowRankActorCriticPolicy,
-        "CnnLowRankPolicy": policies.CnnLowRankActorCriticPolicy,
-        "MultiInputLowRankPolicy": policies.MultiInputLowRankActorCriticPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = on_policy.ALIASES
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         given = by_name(PPO, args, kwargs)

@@ -16,7 +16,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy import policies
 from sb3_flowpolicy.algorithms.demonstrations import (
     fill_replay_buffer,
     follow_recipe,
@@ -27,6 +26,7 @@ from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.bundle.shareable import Shareable
 from sb3_flowpolicy.common.validation import check_settings, either, flag, number, optional
 from sb3_flowpolicy.engine import LOSSES, EngineRuntime
+from sb3_flowpolicy.policies import sac
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
@@ -92,20 +92,7 @@ class SACFlow(OffPolicyFlow, Shareable, SAC):
         "compile": either("auto", flag),
         "autocast": flag,
     }
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowPolicy,
-        "CnnPolicy": policies.CnnFlowPolicy,
-        "MultiInputPolicy": policies.MultiInputFlowPolicy,
-        "FlowPolicy": policies.FlowPolicy,
-        "CnnFlowPolicy": policies.CnnFlowPolicy,
-        "MultiInputFlowPolicy": policies.MultiInputFlowPolicy,
-        "LowRankPolicy": policies.LowRankPolicy,
-        "CnnLowRankPolicy": policies.CnnLowRankPolicy,
-        "MultiInputLowRankPolicy": policies.MultiInputLowRankPolicy,
-        "GaussPolicy": policies.GaussPolicy,
-        "CnnGaussPolicy": policies.CnnGaussPolicy,
-        "MultiInputGaussPolicy": policies.MultiInputGaussPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = sac.ALIASES
 
     def __init__(
         self,

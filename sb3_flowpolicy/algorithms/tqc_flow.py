@@ -10,7 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.common.validation import integer
-from sb3_flowpolicy.policies import contrib as policies
+from sb3_flowpolicy.policies import tqc
 
 
 class TQCFlow(OffPolicyFlow, TQC):
@@ -44,20 +44,7 @@ class TQCFlow(OffPolicyFlow, TQC):
     stock = TQC
     policy_class_of_stock = TQCPolicy
     settings: ClassVar = {**SETTINGS, "top_quantiles_to_drop_per_net": integer(0)}
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": policies.FlowTQCPolicy,
-        "CnnPolicy": policies.CnnFlowTQCPolicy,
-        "MultiInputPolicy": policies.MultiInputFlowTQCPolicy,
-        "FlowPolicy": policies.FlowTQCPolicy,
-        "CnnFlowPolicy": policies.CnnFlowTQCPolicy,
-        "MultiInputFlowPolicy": policies.MultiInputFlowTQCPolicy,
-        "LowRankPolicy": policies.LowRankTQCPolicy,
-        "CnnLowRankPolicy": policies.CnnLowRankTQCPolicy,
-        "MultiInputLowRankPolicy": policies.MultiInputLowRankTQCPolicy,
-        "GaussPolicy": policies.GaussTQCPolicy,
-        "CnnGaussPolicy": policies.CnnGaussTQCPolicy,
-        "MultiInputGaussPolicy": policies.MultiInputGaussTQCPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = tqc.ALIASES
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -27,25 +27,25 @@ from tqdm import tqdm
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.benchmarks.learning_curves import learning_curves
-from sb3_flowpolicy.policies import contrib, on_policy
+from sb3_flowpolicy.policies import crossq, on_policy, tqc
 
 CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "tqc": (
         TQC,
         {
             "stock": "MlpPolicy",
-            "gauss": contrib.GaussTQCPolicy,
-            "lowrank": contrib.LowRankTQCPolicy,
-            "flow": contrib.FlowTQCPolicy,
+            "gauss": tqc.GaussTQCPolicy,
+            "lowrank": tqc.LowRankTQCPolicy,
+            "flow": tqc.FlowTQCPolicy,
         },
     ),
     "crossq": (
         CrossQ,
         {
             "stock": "MlpPolicy",
-            "gauss": contrib.GaussCrossQPolicy,
-            "lowrank": contrib.LowRankCrossQPolicy,
-            "flow": contrib.FlowCrossQPolicy,
+            "gauss": crossq.GaussCrossQPolicy,
+            "lowrank": crossq.LowRankCrossQPolicy,
+            "flow": crossq.FlowCrossQPolicy,
         },
     ),
     "ppo": (

@@ -1,32 +1,32 @@
-r"""What every action density has to be: a pure function of parameters, context and noise."""
+"""The interface of action densities: pure functions of parameters, context and noise."""
 
 from __future__ import annotations
 
 import math
 import numbers
 from abc import ABC, abstractmethod
+from typing import TypeGuard
 
 import torch as th
 from torch import nn
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-# Points up to this many standard deviations away have log-densities and gradients that fit into
-# float32.
+# Log-densities and gradients fit into float32 up to this many standard deviations from the mean.
 FARTHEST = 1e12
 
 
 class ActionDistribution(nn.Module, ABC):
     r"""Conditional density p(u | h) over unsquashed actions u, given a context h.
 
-    Noise is drawn by the caller and handed in, so that the same code runs eagerly, under
-    ``torch.compile``, under ``torch.func.vmap`` and in an exported graph, and so that two
-    implementations can be compared number by number.
+    The caller draws the noise, so that the same code runs eagerly, under ``torch.compile``, under
+    ``torch.func.vmap`` and in an exported graph, and so that two implementations can be compared
+    number by number.
 
     To add a density, subclass this in one file, set :attr:`noise_dim`, write
     :meth:`_rsample_and_log_prob`, :meth:`_log_prob` and :meth:`_mode`, and call
-    :func:`~sb3_flowpolicy.distributions.register_distribution`. Shapes are checked here, once:
-    the subclass is mathematics only. Leading dimensions of context and noise broadcast, so
-    N samples per context cost one evaluation of whatever depends on the context alone.
+    :func:`~sb3_flowpolicy.distributions.register_distribution`. The public methods check shapes, so
+    a subclass contains only mathematics. Leading dimensions of context and noise broadcast: for
+    N samples per context, what depends on the context alone is computed once.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.
@@ -48,7 +48,7 @@ class ActionDistribution(nn.Module, ABC):
     def rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Turn noise into a reparametrised sample and its log-density, in one pass.
+        """Turn noise into a reparametrized sample and its log-density in one pass.
 
         Args:
             context: Features h, shape (..., H).
@@ -58,7 +58,7 @@ class ActionDistribution(nn.Module, ABC):
             The sample u, shape (..., D), and log p(u | h) in nats, shape (...).
 
         Raises:
-            ValueError: If a last dimension does not fit.
+            ValueError: If a last dimension has the wrong size.
         """
         _check_last_dim("context", context, self.context_dim)
         _check_last_dim("noise", noise, self.noise_dim)
@@ -75,7 +75,7 @@ class ActionDistribution(nn.Module, ABC):
             log p(u | h) in nats, shape (...).
 
         Raises:
-            ValueError: If a last dimension does not fit.
+            ValueError: If a last dimension has the wrong size.
         """
         _check_last_dim("context", context, self.context_dim)
         _check_last_dim("value", value, self.action_dim)
@@ -91,10 +91,15 @@ class ActionDistribution(nn.Module, ABC):
             The unsquashed action, shape (..., D).
 
         Raises:
-            ValueError: If the last dimension does not fit.
+            ValueError: If the last dimension has the wrong size.
         """
         _check_last_dim("context", context, self.context_dim)
         return self._mode(context)
+
+    def draw_noise(self, context: th.Tensor, *sample_shape: int) -> th.Tensor:
+        """Draw standard normal noise for ``context``, shape (sample_shape, ..., M)."""
+        shape = (*sample_shape, *context.shape[:-1], self.noise_dim)
+        return th.randn(shape, dtype=context.dtype, device=context.device)
 
     @abstractmethod
     def _rsample_and_log_prob(
@@ -114,24 +119,28 @@ def standard_normal_log_prob(noise: th.Tensor) -> th.Tensor:
 
 
 def score_standard_normal(point: th.Tensor) -> th.Tensor:
-    """Log-density at a given point: farther out than ``FARTHEST`` as low as there, not infinite."""
+    """Log-density at a given point, whose coordinates are clipped so that it stays finite."""
     return standard_normal_log_prob(point.clamp(-FARTHEST, FARTHEST))
 
 
 def soft_bound(value: th.Tensor, bound: float | th.Tensor) -> th.Tensor:
     r"""Squeeze into (-bound, bound) by :math:`x / (1 + |x| / b)`.
 
-    The slope is 1 at zero and never vanishes, so that, unlike a clip, a value that has run
-    into the bound still receives a gradient that can bring it back.
+    The slope is 1 at zero and, unlike that of a clip, never vanishes: values near the bound still
+    receive a gradient.
     """
     return value / (1 + value.abs() / bound)
 
 
-def positive_int(name: str, value: int) -> int:
-    """Return ``value`` if it is an integer of at least 1, otherwise raise ``ValueError``."""
-    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    if not whole or value < 1:
-        raise ValueError(f"{name} must be an integer >= 1, got {value!r}")
+def is_whole(value: object) -> TypeGuard[int]:
+    """Whether this is an integer, numpy's included, but not a boolean."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def positive_int(name: str, value: int, least: int = 1) -> int:
+    """Return ``value`` if it is an integer of at least ``least``, else raise ``ValueError``."""
+    if not is_whole(value) or value < least:
+        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
     return int(value)
 
 

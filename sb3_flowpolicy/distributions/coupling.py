@@ -1,4 +1,4 @@
-"""Couplings: the invertible layers that flows are made of, affine ones and what others share."""
+"""Couplings, the invertible layers of flows: the base class, the affine coupling, pairs."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from torch import nn
 
 from sb3_flowpolicy.distributions.base import soft_bound
 
-# Each coordinate may shrink or grow by e^5 per layer: far beyond what a policy needs, far
-# below what float32 holds after any sensible number of layers.
+# A layer may scale a coordinate by up to e^5: far more than a policy needs, and float32 holds the
+# product over any sensible number of layers.
 LOG_SCALE_BOUND = 5.0
 
 
 class Coupling(nn.Module, ABC):
-    r"""Network that reads one half a of the coordinates and says how to move the other half b.
+    r"""Map of one half b of the coordinates, whose parameters a network computes from the other, a.
 
     .. math:: b \mapsto g(b; \mathrm{network}(a, h))
 
-    The part of its first layer that reads h is computed by the caller, for all layers at once.
+    The caller computes the part of the network's first layer that reads h, for all couplings at
+    once.
 
     Args:
-        passive: Number of coordinates that are read, 0 or more.
+        passive: Number of coordinates that are read, at least 0.
         outputs: Number of outputs of the network.
         hidden: Units of the hidden layers.
     """
@@ -42,18 +43,18 @@ class Coupling(nn.Module, ABC):
         self.last = nn.Linear(hidden[-1], outputs)
 
     def forward(self, passive: th.Tensor, projected: th.Tensor) -> th.Tensor:
-        """Return what decides how b is moved, (..., outputs); zeros mean that it stays."""
+        """Return the parameters of g, (..., outputs); with zeros g is the identity."""
         if self.first is not None:
             projected = projected + self.first(passive)
         return self.last(self.between(projected))
 
     @abstractmethod
     def move(self, active: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return g(b) and log|g'(b)|, both (..., active)."""
+        """Return g(b) and log|g'(b)|, both (..., number of active coordinates)."""
 
     @abstractmethod
     def move_back(self, moved: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Undo :meth:`move`: return b and log|g'(b)|, as there."""
+        """Invert :meth:`move`: return b and log|g'(b)|."""
 
 
 class AffineCoupling(Coupling):
@@ -62,7 +63,7 @@ class AffineCoupling(Coupling):
     .. math:: b \mapsto b \odot \exp(s(a, h)) + t(a, h)
 
     Args:
-        passive: Number of coordinates that are read, 0 or more.
+        passive: Number of coordinates that are read, at least 0.
         active: Number of coordinates that are moved, at least 1.
         hidden: Units of the hidden layers.
 
@@ -74,13 +75,13 @@ class AffineCoupling(Coupling):
         super().__init__(passive, 2 * active, hidden)
 
     def move(self, active: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Scale, then shift."""
+        """Scale and shift."""
         shift, log_scale = outputs.chunk(2, dim=-1)
         log_scale = soft_bound(log_scale, LOG_SCALE_BOUND)
         return active * log_scale.exp() + shift, log_scale
 
     def move_back(self, moved: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Shift back, then scale back."""
+        """Undo the shift and the scaling."""
         shift, log_scale = outputs.chunk(2, dim=-1)
         log_scale = soft_bound(log_scale, LOG_SCALE_BOUND)
         return (moved - shift) * (-log_scale).exp(), log_scale
@@ -104,7 +105,7 @@ class CouplingPair(nn.Module):
     ) -> None:
         super().__init__()
         order, n_first = split_order(features, index)
-        # Two dimensions need no gather: it would only slow the hot path.
+        # With two dimensions the order is the identity, and indexing would only cost time.
         self.in_order = order == sorted(order)
         self.sizes = [n_first, features - n_first]
         self.register_buffer("order", th.tensor(order), persistent=False)
@@ -126,7 +127,7 @@ class CouplingPair(nn.Module):
     def inverse(
         self, value: th.Tensor, projected: Sequence[th.Tensor]
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Undo :meth:`forward`; the log-determinant returned is that of :meth:`forward`."""
+        """Invert :meth:`forward`; the log-determinant is that of :meth:`forward`."""
         halves, ladj = self._split(value), value.new_zeros(())
         for i, coupling in reversed(list(enumerate(self.couplings))):
             outputs = coupling(halves[i], projected[i])
@@ -148,7 +149,7 @@ def split_order(features: int, index: int) -> tuple[list[int], int]:
     """Order the coordinates so that the half read first comes first.
 
     Pair 0 separates even from odd coordinates, pair 1 alternating blocks of two, then of four,
-    and so on; after ceil(log2 D) pairs any two coordinates have been in different halves.
+    and so on. After ceil(log2 D) pairs any two coordinates have been in different halves.
 
     Args:
         features: Number of coordinates D, at least 1.

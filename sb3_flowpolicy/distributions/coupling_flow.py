@@ -1,4 +1,4 @@
-"""Flows made of couplings: everything but what a single coupling does."""
+"""Flows of couplings, of any kind of coupling."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class CouplingFlow(ActionDistribution):
     .. math:: u = (g_L \circ \dots \circ g_1)(\epsilon), \qquad
         \log p(u \mid h) = \log \mathcal N(\epsilon; 0, I) - \sum_{l,i} \log |g_{l,i}'|
 
-    Couplings come in pairs: one half of the coordinates is transformed given the other, then
-    the other given the first. Each pair splits the coordinates in its own way, so that
-    coordinates which share a half in one pair meet in another. With D = 1 the half that is
-    read is empty, and what moves the only coordinate depends on h alone.
+    Couplings come in pairs: one half of the coordinates is transformed given the other, then the
+    other given the first. The pairs split the coordinates differently, so that coordinates in the
+    same half of one pair are in different halves of another. With D = 1 there is no other half, and
+    the transformation of the only coordinate depends on h alone.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.
@@ -36,11 +36,10 @@ class CouplingFlow(ActionDistribution):
         layers: Number of couplings L, at least 1.
         hidden: Units of the hidden layers of each coupling's network.
         init: ``"identity"`` starts as a standard normal for every h. ``"default"`` leaves
-            torch's initialisation.
+            torch's initialization.
 
     Raises:
-        ValueError: If ``layers`` or ``hidden`` holds anything but positive integers, or
-            ``init`` is unknown.
+        ValueError: If ``layers`` or a unit count is not a positive integer, or ``init`` is unknown.
     """
 
     def __init__(
@@ -61,7 +60,7 @@ class CouplingFlow(ActionDistribution):
 
         # The context enters all L couplings through one matrix product.
         self.context_proj = nn.Linear(context_dim, layers * self.hidden[0])
-        # A single coordinate cannot take turns: every coupling transforms it.
+        # With a single coordinate every coupling transforms the same one.
         per_pair = min(2, action_dim)
         pairs = nn.ModuleList(
             CouplingPair(
@@ -74,10 +73,10 @@ class CouplingFlow(ActionDistribution):
 
     @abstractmethod
     def _make_coupling(self, passive: int, active: int) -> Coupling:
-        """Build a coupling that reads ``passive`` coordinates and moves ``active`` ones."""
+        """Build a coupling that reads ``passive`` coordinates and moves ``active`` others."""
 
     def _reset_parameters(self, init: str) -> None:
-        """Initialise as if each first layer were one ``nn.Linear`` on [passive half, h]."""
+        """Initialize as if each first layer were one ``nn.Linear`` on [passive half, h]."""
         weights = self.context_proj.weight.data.chunk(self.layers)
         biases = self.context_proj.bias.data.chunk(self.layers)
         couplings = [coupling for pair in self.pairs for coupling in pair.couplings]
@@ -94,7 +93,7 @@ class CouplingFlow(ActionDistribution):
     def _project(
         self, context: th.Tensor, value: th.Tensor
     ) -> tuple[th.Tensor, list[list[th.Tensor]]]:
-        """Broadcast ``value`` against the context, and hand each pair its share of the latter."""
+        """Broadcast ``value`` against the context and project the context for each pair."""
         shape = th.broadcast_shapes(context.shape[:-1], value.shape[:-1])
         projected = list(self.context_proj(context).chunk(self.layers, dim=-1))
         shares = [[projected.pop(0) for _ in pair.couplings] for pair in self.pairs]

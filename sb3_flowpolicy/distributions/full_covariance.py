@@ -1,4 +1,4 @@
-"""Normal distribution with a full covariance matrix, kept stable by how it is written down."""
+"""Normal distribution with a full covariance matrix, in a numerically stable parametrization."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ OFF_DIAGONAL_BOUND = 10.0
 class FullCovarianceGaussian(DiagGaussian):
     r"""Normal distribution with covariance :math:`\Sigma = L L^\top`.
 
-    The thesis tried this with a clipped Cholesky factor and gave it up for numerical trouble:
-    an off-diagonal entry that is large next to its diagonal makes :math:`L^{-1}` explode.
-    Here scale and correlation are separate. T is unit lower triangular with softly bounded
-    entries, its rows are normalised, and the standard deviations multiply the rows:
+    The thesis tried a clipped Cholesky factor and gave it up because it was numerically unstable:
+    :math:`L^{-1}` explodes if an off-diagonal entry is much larger than the diagonal. Here scale
+    and correlation are separate. T is unit lower triangular with softly bounded entries, its rows
+    are normalized, and the standard deviations multiply the rows:
 
     .. math:: L_{ij} = \sigma_i T_{ij} / \| T_{i \cdot} \|, \qquad T_{ii} = 1
 
-    so :math:`\sigma` is the marginal standard deviation as in :class:`DiagGaussian`, T alone
-    decides the correlations, and no ratio of scales enters any inverse.
+    So :math:`\sigma` is the marginal standard deviation as in :class:`DiagGaussian`, T alone
+    determines the correlations, and no inverse depends on a ratio of scales.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.
@@ -51,7 +51,7 @@ class FullCovarianceGaussian(DiagGaussian):
     def __init__(self, action_dim: int, context_dim: int) -> None:
         super().__init__(action_dim, context_dim)
         n_entries = action_dim * (action_dim - 1) // 2
-        # With one dimension there is nothing to correlate.
+        # One dimension has no correlations.
         self.off_diagonal = nn.Linear(context_dim, n_entries) if n_entries else None
         # Entry (i, j) of T is a lookup in [head output, 0, 1].
         index = th.full((action_dim, action_dim), n_entries)
@@ -86,7 +86,7 @@ class FullCovarianceGaussian(DiagGaussian):
         lower, log_norm = self.unit_lower(context)
         log_diag = log_std - log_norm
         scaled = ((value - loc) * (-log_diag).exp()).clamp(-FARTHEST, FARTHEST)
-        # Solving may multiply by up to 11 per dimension, which float64 survives in 250 of them.
+        # Values may grow by a factor of 11 per dimension: float64 suffices for 250 dimensions.
         noise = th.linalg.solve_triangular(
             lower.double(), scaled.double().unsqueeze(-1), upper=False, unitriangular=True
         ).squeeze(-1)

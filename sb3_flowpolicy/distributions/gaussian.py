@@ -1,4 +1,4 @@
-"""Diagonal normal distribution: what stock SAC explores with."""
+"""Diagonal normal distribution, as in stock SAC."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sb3_flowpolicy.distributions.base import (
     standard_normal_log_prob,
 )
 
-# SB3's clamp, so that a stock SAC actor and ours are the same function.
+# SB3's bounds, so that a stock SAC actor and ours are the same function.
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
 
@@ -21,7 +21,7 @@ class DiagGaussian(ActionDistribution):
 
     .. math:: u = \mu(h) + \sigma(h) \odot \epsilon, \qquad \epsilon \sim \mathcal N(0, I_D)
 
-    The heads carry the names and the clamp of SB3's SAC actor, so that a stock checkpoint fits.
+    The heads have the names and the bounds of SB3's SAC actor, so that its checkpoints fit.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.

@@ -1,4 +1,4 @@
-"""Normal distribution that correlates actions as the policy's own last layer does (Lattice)."""
+"""Normal distribution whose correlations come from the last layer of the policy (Lattice)."""
 
 from __future__ import annotations
 
@@ -15,41 +15,43 @@ from sb3_flowpolicy.distributions.base import (
 )
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
-# Actions steadier than e^-10 = 0.00005 are as good as deterministic, and keep float64's digits
-# for the covariance's Cholesky factor. The upper bound is SB3's.
+# A standard deviation of e^-10 = 0.00005 is practically deterministic and leaves enough digits of
+# float64 for the Cholesky factor of the covariance. The upper bound is SB3's.
 LOG_STD_MIN = -10.0
 LOG_STD_MAX = 2.0
 
 
 class Lattice(DiagGaussian):
-    r"""Normal distribution made of noise in the features and of noise in the actions.
+    r"""Normal distribution that adds noise to the features and to the actions.
 
     .. math:: u = W (h + \alpha \sigma_h(h) \odot \epsilon_h) + b + \sigma_a(h) \odot \epsilon_a
         \;\sim\; \mathcal N \left( W h + b, \;
         \alpha^2 W \mathrm{diag}(\sigma_h^2) W^\top + \mathrm{diag}(\sigma_a^2) \right)
 
-    W is the layer that computes the mean, so actions that the policy moves together are explored
-    together. Of this distribution, D normals are a sample: :math:`u = W h + b + L \epsilon` with
-    the covariance's Cholesky factor L, computed in float64. No pivot of it can be less than
-    :math:`\sigma_a^2`, and none is let fall below: no failure, no NaN.
+    W is the weight of the layer that computes the mean, so actions that the policy moves together
+    are explored together. A sample takes D normals: :math:`u = W h + b + L \epsilon` with the
+    Cholesky factor L of the covariance, computed in float64. In exact arithmetic every pivot is at
+    least :math:`\sigma_a^2`. The computed ones are clamped there, so that the factorization cannot
+    fail.
 
-    The same as in the paper: the covariance, with the mean's W in it and gradients through it, as
-    for its SAC; the scale alpha; one feature's noise on all actions at once. Different:
+    As in the paper, the covariance contains the W of the mean and, as in its SAC, passes gradients
+    to it; alpha scales the noise of the features; the noise of one feature moves all actions at
+    once. The differences are:
 
     - Standard deviations come from linear heads, as in the authors' variant without correlation in
-      time. Their main one is gSDE's, :math:`\sigma_i^2 = \sum_j S_{ji}^2 h_j^2` with learned S,
-      which leaves no noise where h is zero.
-    - They draw noise for every feature and action, and keep the matrices it comes from for a
-      number of steps. Here D normals are drawn, at every step. For noise that correlates in time
-      there is ``action_noise_color``, which then acts on the actions, not on single features.
+      time. Their main variant is gSDE's, :math:`\sigma_i^2 = \sum_j S_{ji}^2 h_j^2` with learned S,
+      which has no noise where h is zero.
+    - The authors draw noise for every feature and action, and keep the noise matrices for a number
+      of steps. Here D normals are drawn at every step. ``action_noise_color`` correlates them in
+      time, in the space of actions rather than of features.
     - Log standard deviations are bounded softly, :math:`\sigma \in (e^{-10}, e^2)`, not clipped.
-      Nothing is added to the variance (their ``std_reg``), and the mean is not clipped.
-    - For on-policy algorithms, too, features are learned through the standard deviations.
+      Nothing is added to the variance (the authors' ``std_reg``), and the mean is not clipped.
+    - Gradients of the standard deviations reach the features with on-policy algorithms, too.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.
         context_dim: Number of context features H, at least 1.
-        alpha: Scale of the features' noise, 0 or more; 0 leaves a diagonal covariance.
+        alpha: Scale of the noise of the features, at least 0; 0 gives a diagonal covariance.
 
     Raises:
         ValueError: If ``alpha`` is negative or not finite.
@@ -68,14 +70,14 @@ class Lattice(DiagGaussian):
 
     def __init__(self, action_dim: int, context_dim: int, alpha: float = 1.0) -> None:
         super().__init__(action_dim, context_dim)
-        is_number = isinstance(alpha, int | float) and not isinstance(alpha, bool)
-        if not is_number or not 0 <= alpha < math.inf:
+        number = isinstance(alpha, int | float) and not isinstance(alpha, bool)
+        if not number or not 0 <= alpha < math.inf:
             raise ValueError(f"alpha must be a finite number >= 0, got {alpha!r}")
         self.alpha = float(alpha)
         self.latent_log_std = nn.Linear(context_dim, context_dim)
 
     def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return the mean and the log standard deviation of the actions' own noise, (..., D)."""
+        """Return the mean and the log standard deviation of the noise of the actions, (..., D)."""
         return self.mu(context), _bounded(self.log_std(context))
 
     def scale_tril(self, context: th.Tensor, log_std: th.Tensor) -> th.Tensor:
@@ -83,11 +85,11 @@ class Lattice(DiagGaussian):
 
         Args:
             context: Features h, shape (..., H).
-            log_std: Log standard deviation of the actions' own noise, shape (..., D).
+            log_std: Log standard deviation of the noise of the actions, shape (..., D).
         """
         latent_variance = (2 * _bounded(self.latent_log_std(context)).double()).exp()
         weight = self.alpha * self.mu.weight.double()
-        # Products of W's rows, one per entry of the covariance: a single matrix product for all.
+        # The products of the rows of W make the whole covariance a single matrix product.
         pairs = (weight.unsqueeze(0) * weight.unsqueeze(1)).flatten(0, 1)
         rest = (latent_variance @ pairs.mT).unflatten(-1, (self.action_dim, self.action_dim))
         variance = (2 * log_std.double()).exp()
@@ -117,7 +119,7 @@ class Lattice(DiagGaussian):
 
 
 def _bounded(log_std: th.Tensor) -> th.Tensor:
-    """Squeeze into (LOG_STD_MIN, LOG_STD_MAX), slope 1 at zero."""
+    """Squeeze into (LOG_STD_MIN, LOG_STD_MAX), with slope 1 at zero."""
     return soft_bound(log_std, th.where(log_std > 0, LOG_STD_MAX, -LOG_STD_MIN))
 
 

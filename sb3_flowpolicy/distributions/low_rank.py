@@ -8,7 +8,7 @@ from torch import nn
 from sb3_flowpolicy.distributions.base import FARTHEST, LOG_SQRT_2PI, positive_int, soft_bound
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
-# Three units of u reach tanh(3) = 0.995: a single column of V spans the whole action box.
+# tanh(3) = 0.995: with this bound a single column of V spans the whole action box.
 COV_FACTOR_BOUND = 3.0
 
 
@@ -16,16 +16,16 @@ class LowRankGaussian(DiagGaussian):
     r"""Normal distribution with covariance :math:`\Sigma = V V^\top + \mathrm{diag}(\sigma^2)`.
 
     A sample takes M = D + K normals, :math:`u = \mu + V \epsilon_K + \sigma \odot \epsilon_D`.
-    Instead of inverting the K x K capacitance matrix, whose entries grow as
-    :math:`1 / \sigma^2`, the density is read off an orthonormal basis Q R = [V / sigma; I]:
+    The entries of the K x K capacitance matrix grow as :math:`1 / \sigma^2`. Instead of inverting
+    it, the density uses the QR decomposition Q R = [V / sigma; I]:
 
     .. math::
         \log\det\Sigma = 2 \sum_i \log\sigma_i + 2 \sum_k \log R_{kk}, \qquad
         (u - \mu)^\top \Sigma^{-1} (u - \mu) = \| n - Q Q^\top n \|^2
 
     with :math:`n = [\epsilon_D; -\epsilon_K]` for a sample and :math:`n = [(u - \mu) / \sigma; 0]`
-    for a given point. Every :math:`R_{kk} \ge 1` by construction, so nothing can overflow or
-    turn negative, down to :math:`\sigma = e^{-20}`, for any K.
+    for a given point. As every :math:`R_{kk} \ge 1`, nothing overflows or becomes negative, for any
+    K and down to :math:`\sigma = e^{-20}`.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.
@@ -36,7 +36,7 @@ class LowRankGaussian(DiagGaussian):
         ValueError: If ``rank`` is not between 1 and D.
 
     References:
-        Thesis eq. 2.13, which clips V; here it is softly bounded.
+        Thesis eq. 2.13, which clips V; here V is softly bounded.
 
     Example:
         >>> import torch as th

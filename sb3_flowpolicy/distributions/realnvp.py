@@ -12,20 +12,8 @@ class RealNVP(CouplingFlow):
     .. math:: u = (g_L \circ \dots \circ g_1)(\epsilon), \qquad
         \log p(u \mid h) = \log \mathcal N(\epsilon; 0, I) - \sum_{l,i} s_{l,i}
 
-    How couplings alternate says :class:`CouplingFlow`. With D = 1 the flow is a normal
-    distribution whose parameters depend on h.
-
-    Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
-        layers: Number of couplings L, at least 1.
-        hidden: Units of the hidden layers of each coupling's network.
-        init: ``"identity"`` starts as a standard normal for every h. ``"default"`` leaves
-            torch's initialisation, as the thesis had it.
-
-    Raises:
-        ValueError: If ``layers`` or ``hidden`` holds anything but positive integers, or
-            ``init`` is unknown.
+    :class:`CouplingFlow` documents the arguments and how the couplings alternate. With D = 1 the
+    flow is a normal distribution whose parameters depend on h.
 
     References:
         Density estimation using Real NVP (Dinh et al., 2017); Structured Output Learning with
@@ -37,7 +25,7 @@ class RealNVP(CouplingFlow):
         >>> flow = RealNVP(action_dim=2, context_dim=3)
         >>> noise = th.randn(5, 2)
         >>> u, log_prob = flow.rsample_and_log_prob(th.randn(5, 3), noise)
-        >>> th.equal(u, noise)  # the identity, until it is trained
+        >>> th.equal(u, noise)  # the identity before training
         True
     """
 

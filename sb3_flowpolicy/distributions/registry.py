@@ -1,4 +1,4 @@
-"""Names for densities, so that ``policy_kwargs`` and YAML files can ask for them."""
+"""Names of densities, for ``policy_kwargs`` and YAML files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _REGISTRY: dict[str, type[ActionDistribution]] = {
 def register_distribution(name: str, distribution_class: type[ActionDistribution]) -> None:
     """Make a density available as ``policy_kwargs=dict(distribution=name)``.
 
-    A saved model refers to the density by name: register it before loading, too.
+    A saved model refers to the density by name, so register it before loading the model, too.
 
     Args:
         name: Name to register, not taken by another class.
@@ -34,7 +34,7 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
             ``action_dim``, ``context_dim`` and keyword arguments of its own.
 
     Raises:
-        ValueError: If the name is taken or the class is no ``ActionDistribution``.
+        ValueError: If the name is taken or the class is not an ``ActionDistribution``.
 
     Example:
         >>> from sb3_flowpolicy.distributions import DiagGaussian
@@ -47,8 +47,9 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
         >>> make_distribution("sharp", action_dim=2, context_dim=8).action_dim
         2
     """
-    is_class = inspect.isclass(distribution_class)
-    if not is_class or not issubclass(distribution_class, ActionDistribution):
+    if not (
+        isinstance(distribution_class, type) and issubclass(distribution_class, ActionDistribution)
+    ):
         raise ValueError(
             f"distribution_class must be a subclass of ActionDistribution, "
             f"got {distribution_class!r}"
@@ -75,7 +76,7 @@ def make_distribution(
         **distribution_kwargs: Passed to the density's constructor.
 
     Returns:
-        The density, not squashed.
+        The density of unsquashed actions.
 
     Raises:
         ValueError: If the name or a keyword argument is unknown.

@@ -1,4 +1,4 @@
-"""Conditional neural spline flow: couplings that bend each coordinate at several places."""
+"""Conditional neural spline flow."""
 
 from __future__ import annotations
 
@@ -9,40 +9,37 @@ from typing import Literal
 import torch as th
 from torch.nn.functional import pad, softmax
 
-from sb3_flowpolicy.distributions.base import soft_bound
+from sb3_flowpolicy.distributions.base import positive_int, soft_bound
 from sb3_flowpolicy.distributions.coupling import Coupling
 from sb3_flowpolicy.distributions.coupling_flow import CouplingFlow
 
-# Beyond it a spline is the identity: tanh(5) = 0.9999 leaves next to nothing of the action box.
+# A spline is the identity outside (-5, 5); tanh(5) = 0.9999 is almost the edge of the action box.
 BOUND = 5.0
-# Slopes at the knots, and ratios of two bins' widths or heights, are between this and its inverse.
+# Slopes at the knots, and ratios of two bins' widths or heights, lie between this and its inverse.
 MIN_SLOPE = 1e-3
 
 
 class Spline(CouplingFlow):
     r"""Normalizing flow of monotonic rational-quadratic splines, conditioned on h.
 
-    Within (-5, 5) each coordinate is bent by a spline of K bins, whose widths, heights and slopes
-    at the knots are the outputs of the coupling's network; outside it is left alone. How
-    couplings alternate says :class:`CouplingFlow`. Where a RealNVP of one dimension is a normal
-    distribution, this one can have several modes.
+    A spline of K bins maps each coordinate within (-5, 5); outside it is the identity. A network
+    computes the widths and heights of the bins and the slopes at the knots.
+    :class:`CouplingFlow` documents how the couplings alternate. With D = 1 a RealNVP is a normal
+    distribution, whereas this flow can have several modes.
 
     Args:
         action_dim: Number of action dimensions D, at least 1.
         context_dim: Number of context features H, at least 1.
-        layers: Number of couplings L, at least 1.
-        hidden: Units of the hidden layers of each coupling's network.
-        init: ``"identity"`` starts as a standard normal for every h. ``"default"`` leaves
-            torch's initialisation.
+        layers: As for :class:`CouplingFlow`.
+        hidden: As for :class:`CouplingFlow`.
+        init: As for :class:`CouplingFlow`.
         bins: Number of bins K, at least 2.
 
     Raises:
-        ValueError: If ``layers``, ``hidden`` or ``bins`` holds anything but such integers, or
-            ``init`` is unknown.
+        ValueError: As :class:`CouplingFlow`, or if ``bins`` is not an integer of at least 2.
 
     References:
-        Neural Spline Flows (Durkan et al., 2019); between its couplings this flow has no linear
-        layers.
+        Neural Spline Flows (Durkan et al., 2019); here without linear layers between couplings.
 
     Example:
         >>> import torch as th
@@ -50,7 +47,7 @@ class Spline(CouplingFlow):
         >>> flow = Spline(action_dim=2, context_dim=3)
         >>> noise = th.randn(5, 2)
         >>> u, log_prob = flow.rsample_and_log_prob(th.randn(5, 3), noise)
-        >>> th.allclose(u, noise, atol=1e-5)  # the identity, until it is trained
+        >>> th.allclose(u, noise, atol=1e-5)  # the identity before training
         True
     """
 
@@ -63,9 +60,7 @@ class Spline(CouplingFlow):
         init: Literal["identity", "default"] = "identity",
         bins: int = 8,
     ) -> None:
-        if isinstance(bins, bool) or not isinstance(bins, int) or bins < 2:
-            raise ValueError(f"bins must be an integer >= 2, got {bins!r}")
-        self.bins = bins
+        self.bins = positive_int("bins", bins, least=2)
         super().__init__(action_dim, context_dim, layers, hidden, init)
 
     def _make_coupling(self, passive: int, active: int) -> SplineCoupling:
@@ -73,7 +68,7 @@ class Spline(CouplingFlow):
 
 
 class SplineCoupling(Coupling):
-    r"""Coupling that bends with a monotonic rational-quadratic spline.
+    r"""Coupling with a monotonic rational-quadratic spline.
 
     Within bin k, from knot :math:`(x_k, y_k)` to the next, with width w, height h, mean slope
     s = h / w, slopes :math:`d_k` at the knots and :math:`z = (x - x_k) / w`:
@@ -81,7 +76,7 @@ class SplineCoupling(Coupling):
     .. math:: y = y_k + h \frac{s z^2 + d_k z (1 - z)}{s + (d_k + d_{k+1} - 2 s) z (1 - z)}
 
     Args:
-        passive: Number of coordinates that are read, 0 or more.
+        passive: Number of coordinates that are read, at least 0.
         active: Number of coordinates that are moved, at least 1.
         hidden: Units of the hidden layers.
         bins: Number of bins K, at least 2.
@@ -98,7 +93,7 @@ class SplineCoupling(Coupling):
         """Evaluate the spline at ``active``."""
         inside = active.clamp(-BOUND, BOUND)
         x, y, width, height, left, right = self._bin_of(inside, outputs, by_height=False)
-        # In float32 a knot is up to a thousandth of the narrowest bin off.
+        # In float32 the error of a knot is up to a thousandth of the narrowest bin.
         z = ((inside - x) / width).clamp(0.0, 1.0)
         moved = y + height * _share(z, height / width, left, right)
         ladj = _log_slope(z, height / width, left, right)
@@ -113,8 +108,7 @@ class SplineCoupling(Coupling):
         share = (inside - y) / height
         bend = (left + right - 2 * slope) * share
         a, b, c = slope - left + bend, left - bend, -slope * share
-        # Of the two forms of the solution this is the one that does not cancel; what is under the
-        # root is positive, but for rounding.
+        # This form of the solution avoids cancellation. The radicand is positive up to rounding.
         root = (b.square() - 4 * a * c).clamp_min(1e-12).sqrt()
         z = (-2 * c / (b + root)).clamp(0.0, 1.0)
         ladj = _log_slope(z, slope, left, right)
@@ -124,8 +118,8 @@ class SplineCoupling(Coupling):
     def _bin_of(
         self, value: th.Tensor, outputs: th.Tensor, by_height: bool
     ) -> tuple[th.Tensor, ...]:
-        """Return left end, lower end, width, height and the two slopes of each value's bin."""
-        # Knots take more digits than bfloat16 has.
+        """Return left end, lower end, width, height and both slopes of the bin of each value."""
+        # bfloat16 has too few digits for the knots.
         outputs = outputs.to(value).unflatten(-1, (-1, 3 * self.bins - 1))
         widths, heights, slopes = outputs.split([self.bins, self.bins, self.bins - 1], dim=-1)
         sizes = [
@@ -134,9 +128,9 @@ class SplineCoupling(Coupling):
         ]
         ends = [size.cumsum(-1) - BOUND for size in sizes]
         starts = [end - size for end, size in zip(ends, sizes, strict=True)]
-        # At both ends the slope is 1, the identity's.
+        # The slope at both ends is 1, as that of the identity.
         slopes = pad(soft_bound(slopes, -math.log(MIN_SLOPE)), (1, 1)).exp()
-        # A sum over all bins, of which one counts, takes less than looking that one up.
+        # A sum over all bins with one-hot weights is faster than a gather.
         above = value.unsqueeze(-1) >= ends[by_height][..., :-1]
         reached = pad(above, (1, 0), value=True)
         counts = (reached & ~pad(above, (0, 1), value=False)).to(value)
@@ -145,7 +139,7 @@ class SplineCoupling(Coupling):
 
 
 def _share(z: th.Tensor, slope: th.Tensor, left: th.Tensor, right: th.Tensor) -> th.Tensor:
-    """Return how much of the bin's height is reached at z."""
+    """Return the share of the bin's height that is reached at z."""
     between = z * (1 - z)
     return (slope * z.square() + left * between) / (slope + (left + right - 2 * slope) * between)
 

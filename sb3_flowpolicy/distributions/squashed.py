@@ -16,8 +16,8 @@ class TanhSquashed(ActionDistribution):
     .. math:: \log p(a \mid h) = \log p(u \mid h)
         - \sum_i 2 (\log 2 - u_i - \mathrm{softplus}(-2 u_i))
 
-    This form of the log-Jacobian is exact where :math:`\log(1 - a^2)` has long turned to
-    :math:`-\infty`, and needs no epsilon.
+    This form of the log-Jacobian needs no epsilon and stays exact where rounding turns
+    :math:`\log(1 - a^2)` into :math:`-\infty`.
 
     Args:
         base: Density of the unsquashed action u.
@@ -29,7 +29,7 @@ class TanhSquashed(ActionDistribution):
         >>> import torch as th
         >>> from sb3_flowpolicy.distributions import RealNVP
         >>> density = TanhSquashed(RealNVP(action_dim=2, context_dim=3))
-        >>> density.log_prob(th.zeros(1, 3), th.ones(1, 2)).isfinite()  # the very edge
+        >>> density.log_prob(th.zeros(1, 3), th.ones(1, 2)).isfinite()  # at the corner of the box
         tensor([True])
     """
 
@@ -45,7 +45,7 @@ class TanhSquashed(ActionDistribution):
         return th.tanh(unsquashed), log_prob - tanh_ladj(unsquashed)
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
-        # The edge itself has no preimage: score the last number before it.
+        # The edge has no preimage. Score the largest number below it instead.
         edge = 1 - th.finfo(value.dtype).eps
         unsquashed = th.atanh(value.clamp(-edge, edge))
         return self.base.log_prob(context, unsquashed) - tanh_ladj(unsquashed)

@@ -1,4 +1,4 @@
-"""Actors and SB3 policy classes: where SB3's words become those of the densities."""
+"""Actors and SB3 policy classes that use the densities of ``sb3_flowpolicy.distributions``."""
 
 from sb3_flowpolicy.policies.actor import FlowActor
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy

@@ -1,4 +1,4 @@
-"""The actor: SB3's SAC actor with its normal heads replaced by any registered density."""
+"""The actor: SB3's SAC actor with any registered density in place of its Gaussian heads."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
 from sb3_flowpolicy.distributions.base import positive_int
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
-# What `density.base.` would prefix in a state dict lives at the actor's own level instead, as
-# SB3's `mu` and `log_std` do: a Gauss actor and a stock SAC actor exchange checkpoints.
+# State dicts omit this prefix, so that the heads have the names of SB3's `mu` and `log_std`, and a
+# Gauss actor and a stock SAC actor can load each other's checkpoints.
 _HEAD_PREFIX = "density.base."
 
 
@@ -29,13 +29,13 @@ class FlowActor(Actor):
     .. math:: a = \tanh(u), \qquad u \sim p(\cdot \mid h), \qquad h = \mathrm{latent\_pi}(s)
 
     Actions are in SB3's scaled box [-1, 1]^D, flattened to (batch, D) whatever the shape of the
-    action space. Everything that samples accepts the noise to use.
+    action space. All methods that sample accept the noise to use.
 
     Args:
         observation_space: Observation space.
         action_space: Box with finite bounds.
         net_arch: Units of the hidden layers that compute h.
-        features_extractor: Network that turns observations into features.
+        features_extractor: Network that computes features of observations.
         features_dim: Number of features.
         activation_fn: Activation between the hidden layers.
         normalize_images: Whether to divide images by 255.
@@ -60,8 +60,8 @@ class FlowActor(Actor):
         distribution: str = "realnvp",
         distribution_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        # Not Actor.__init__: it would build normal heads to be thrown away, and the random
-        # numbers they draw would keep GaussPolicy from starting with stock SAC's weights.
+        # Not Actor.__init__: it would build Gaussian heads, and the random numbers that they draw
+        # would keep GaussPolicy from starting with the weights of stock SAC.
         BasePolicy.__init__(
             self,
             observation_space,
@@ -84,7 +84,7 @@ class FlowActor(Actor):
             distribution, action_dim, context_dim, **self.distribution_kwargs
         )
         clashes = dict(density.named_children()).keys() & dict(self.named_children()).keys()
-        if clashes:
+        if clashes:  # their parameters would have the same names in a state dict
             raise ValueError(
                 f'distribution "{distribution}" must not name a submodule as the actor does, '
                 f"got {sorted(clashes)}"
@@ -95,21 +95,18 @@ class FlowActor(Actor):
         self.register_load_state_dict_pre_hook(_lower_heads)
 
     def _make_latent_pi(self) -> nn.Sequential:
-        """Build the hidden layers."""
-        layers = create_mlp(self.features_dim, -1, self.net_arch, self.activation_fn)
-        return nn.Sequential(*layers)
+        return nn.Sequential(*create_mlp(self.features_dim, -1, self.net_arch, self.activation_fn))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = BasePolicy._get_constructor_parameters(self)
-        data.update(
-            net_arch=self.net_arch,
-            features_dim=self.features_dim,
-            features_extractor=self.features_extractor,
-            activation_fn=self.activation_fn,
-            distribution=self.distribution,
-            distribution_kwargs=self.distribution_kwargs,
-        )
-        return data
+        return {
+            **BasePolicy._get_constructor_parameters(self),
+            "net_arch": self.net_arch,
+            "features_dim": self.features_dim,
+            "features_extractor": self.features_extractor,
+            "activation_fn": self.activation_fn,
+            "distribution": self.distribution,
+            "distribution_kwargs": self.distribution_kwargs,
+        }
 
     def context(self, obs: PyTorchObs) -> th.Tensor:
         """Return the features h that the density is conditioned on, shape (batch, H)."""
@@ -117,8 +114,7 @@ class FlowActor(Actor):
 
     def draw_noise(self, context: th.Tensor, *sample_shape: int) -> th.Tensor:
         """Draw standard normal noise that fits ``context``, shape (sample_shape, batch, M)."""
-        shape = (*sample_shape, *context.shape[:-1], self.density.noise_dim)
-        return th.randn(shape, dtype=context.dtype, device=context.device)
+        return self.density.draw_noise(context, *sample_shape)
 
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, noise: th.Tensor | None = None
@@ -128,7 +124,7 @@ class FlowActor(Actor):
         Args:
             obs: Batch of observations.
             deterministic: Whether to return the density's mode instead of a sample.
-            noise: Standard normals to sample with, shape (batch, M). Default: drawn here.
+            noise: Standard normals, shape (batch, M). Default: drawn here.
         """
         if deterministic:
             return self.density.mode(self.context(obs))
@@ -137,11 +133,11 @@ class FlowActor(Actor):
     def action_log_prob(
         self, obs: PyTorchObs, noise: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Sample actions by reparametrisation and score them, in one pass.
+        """Sample reparametrized actions and score them in one pass.
 
         Args:
             obs: Batch of observations.
-            noise: Standard normals to sample with, shape (batch, M). Default: drawn here.
+            noise: Standard normals, shape (batch, M). Default: drawn here.
 
         Returns:
             Actions in [-1, 1], shape (batch, D), and their log-density, shape (batch,).
@@ -151,7 +147,7 @@ class FlowActor(Actor):
         return self.density.rsample_and_log_prob(context, noise)
 
     def log_prob(self, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
-        """Score arbitrary actions; the edge of the box gives a finite value.
+        """Score arbitrary actions; the log-density is finite at the edge of the box, too.
 
         Args:
             obs: Batch of observations.
@@ -161,8 +157,8 @@ class FlowActor(Actor):
             Log-density in nats, shape (batch,).
 
         Raises:
-            ValueError: If there is not one action per observation, or one is outside [-1, 1]
-                (``policy.scale_action`` brings an environment's actions there).
+            ValueError: If there is not one action per observation, or an action is outside
+                [-1, 1]; ``policy.scale_action`` maps an environment's actions to this range.
         """
         context = self.context(obs)
         action = th.as_tensor(action, dtype=context.dtype, device=context.device)
@@ -187,7 +183,7 @@ class FlowActor(Actor):
             n_samples: Number of samples per observation, at least 1.
 
         Returns:
-            Entropy in nats, shape (batch,); at most D log 2, that of the uniform distribution.
+            Entropy in nats, shape (batch,); at most D log 2, the value of the uniform distribution.
         """
         context = self.context(obs)
         noise = self.draw_noise(context, positive_int("n_samples", n_samples))
@@ -207,10 +203,10 @@ class FlowActor(Actor):
         context = self.context(obs)
         noise = self.draw_noise(context, n_samples)
         actions = self.density.rsample_and_log_prob(context, noise)[0].movedim(0, -1)
-        centred = actions - actions.mean(-1, keepdim=True)
-        # A dimension that never varies correlates with nothing but itself.
+        centered = actions - actions.mean(-1, keepdim=True)
+        # A constant dimension has correlation 0 with all others and 1 with itself.
         tiny = th.finfo(actions.dtype).tiny
-        unit = centred / centred.norm(dim=-1, keepdim=True).clamp_min(tiny)
+        unit = centered / centered.norm(dim=-1, keepdim=True).clamp_min(tiny)
         correlation = (unit @ unit.mT).clamp(-1, 1)
         return correlation.diagonal_scatter(th.ones_like(correlation[..., 0]), dim1=-2, dim2=-1)
 

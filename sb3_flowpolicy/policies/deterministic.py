@@ -1,4 +1,4 @@
-"""What to do without exploring: the base mean, or the best of a fixed set of candidates."""
+"""Deterministic actions: the image of the base mean, or the best of a fixed set of candidates."""
 
 from __future__ import annotations
 
@@ -12,19 +12,8 @@ from sb3_flowpolicy.policies.actor import FlowActor
 
 MODES = ("base", "log_prob", "q")
 DETERMINISTIC_DEFAULTS: dict[str, Any] = {"deterministic_mode": "base", "deterministic_samples": 64}
-# Candidates that are held in memory at once, whatever the number of observations.
+# Bounds the memory: many observations are processed in parts of this many candidates.
 _MOST_AT_ONCE = 2**16
-
-
-def check_settings(mode: str, n_candidates: int, use_sde: bool) -> None:
-    """Raise ``ValueError`` if this is no way to choose an action."""
-    if mode not in MODES:
-        raise ValueError(f"deterministic_mode must be one of {MODES}, got {mode!r}")
-    if mode != "base" and use_sde:
-        raise ValueError(f'deterministic_mode must be "base" with use_sde=True, got {mode!r}')
-    is_count = isinstance(n_candidates, int) and not isinstance(n_candidates, bool)
-    if not is_count or n_candidates < 2:
-        raise ValueError(f"deterministic_samples must be an integer >= 2, got {n_candidates!r}")
 
 
 def best_actions(
@@ -32,17 +21,17 @@ def best_actions(
 ) -> th.Tensor:
     """Choose the best of several candidates for each observation.
 
-    The candidates are the images of :func:`candidate_noise`, the base mean first among them; of
-    equally good ones the first is taken. No random numbers are drawn: the same observation has
-    the same action, today and after loading.
+    The candidates are the images of :func:`candidate_noise`, starting with the base mean. The first
+    of several equally good ones is taken. No random numbers are drawn: an observation always leads
+    to the same action.
 
     Args:
         actor: Actor with a density.
         critic: Critics of the same policy.
         obs: Batch of observations.
-        mode: ``"log_prob"`` takes the most likely candidate, by the density of the squashed
-            action (``actor.log_prob``); ``"q"`` the one with the largest value, by the smallest
-            of the critics as in SAC's loss.
+        mode: ``"log_prob"`` takes the candidate with the largest density as a squashed action
+            (``actor.log_prob``); ``"q"`` the one with the largest value, where the value is the
+            minimum over the critics, as in SAC's loss.
         n_candidates: Number of candidates N, at least 2.
 
     Returns:
@@ -67,33 +56,31 @@ def best_actions(
 
 
 def critic_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Return what the critics of SAC, TQC or CrossQ expect of actions.
+    """Return the values that the critics of SAC, TQC or CrossQ assign to actions.
 
     Args:
         critic: Critics of a policy.
-        features: What their extractor made of observations, (..., F).
+        features: Features of the observations, from the critics' extractor, (..., F).
         actions: Actions in [-1, 1], (..., D).
 
     Returns:
         Values, (n_critics, ...).
     """
     pairs = th.cat([features, actions], dim=-1)
-    # One value each, or the quantiles of its distribution.
+    # A network returns one value, or quantiles whose mean is the value.
     return th.stack([q_network(pairs).mean(-1) for q_network in critic.q_networks])
 
 
 @lru_cache(maxsize=8)
 def candidate_noise(n_candidates: int, noise_dim: int) -> th.Tensor:
-    """Return zero, the base mean, and points spread like standard normals.
-
-    They are Sobol points: 64 of them cover the density more evenly than random ones would.
+    """Return zero, which is the base mean, and Sobol points distributed like standard normals.
 
     Args:
         n_candidates: Number of points N, at least 2.
         noise_dim: Dimension M of the noise.
 
     Returns:
-        The points, (N, M), the same at every call.
+        The points, (N, M), the same in every call.
 
     Example:
         >>> candidate_noise(64, 2).mean(0).abs().max() < 0.1
@@ -101,6 +88,6 @@ def candidate_noise(n_candidates: int, noise_dim: int) -> th.Tensor:
     """
     sobol = th.quasirandom.SobolEngine(noise_dim, scramble=True, seed=0)
     uniform = sobol.draw(n_candidates - 1, dtype=th.float64)
-    # The ends of the interval are no points of a normal distribution.
+    # The normal quantiles of 0 and 1 are infinite.
     points = th.special.ndtri(uniform.clamp(1e-9, 1 - 1e-9))
     return th.cat([th.zeros(1, noise_dim, dtype=th.float64), points]).float()

@@ -1,8 +1,8 @@
-"""A policy class's forms for images and for dictionaries, as SB3 names them."""
+"""The forms of policy classes for images and dictionaries, and the names of all of them."""
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
@@ -13,66 +13,49 @@ from stable_baselines3.common.torch_layers import (
     NatureCNN,
 )
 
-Policy = TypeVar("Policy", bound=BasePolicy)
+_FORMS = {"Cnn": ("image", NatureCNN), "MultiInput": ("dictionary", CombinedExtractor)}
 
 
-def for_images(*policies: type[Policy]) -> tuple[type[Policy], ...]:
-    """Return each class with ``Cnn`` before its name and SB3's ``NatureCNN`` in front.
+def with_forms(module: dict[str, Any], **policies: type[BasePolicy]) -> dict[str, Any]:
+    """Derive the ``Cnn...`` and ``MultiInput...`` form of each class; return all by alias.
 
     Args:
-        *policies: Classes with a ``default_features_extractor_class``.
+        module: ``globals()`` of the module that defines the classes. The forms are added to it,
+            because a saved model refers to its policy class by module and name.
+        **policies: Alias -> class with a ``default_features_extractor_class``. The first is the
+            default, which ``"MlpPolicy"`` stands for.
+
+    Returns:
+        The ``policy_aliases`` of an algorithm.
 
     Example:
-        >>> from sb3_flowpolicy import GaussPolicy
-        >>> (policy,) = for_images(GaussPolicy)
-        >>> policy.__name__, policy.__doc__
-        ('CnnGaussPolicy', ':class:`GaussPolicy` for image observations.')
+        >>> from sb3_flowpolicy.policies.sac import ALIASES
+        >>> ALIASES["CnnGaussPolicy"].__doc__
+        ':class:`GaussPolicy` for image observations.'
+        >>> ALIASES["MultiInputPolicy"].__name__
+        'MultiInputFlowPolicy'
     """
-    return tuple(_with(policy, "Cnn", "image", NatureCNN) for policy in policies)
-
-
-def for_dicts(*policies: type[Policy]) -> tuple[type[Policy], ...]:
-    """Return each class with ``MultiInput`` before its name and SB3's ``CombinedExtractor``.
-
-    Args:
-        *policies: Classes with a ``default_features_extractor_class``.
-    """
-    extractor = CombinedExtractor
-    return tuple(_with(policy, "MultiInput", "dictionary", extractor) for policy in policies)
+    default = next(iter(policies))
+    aliases: dict[str, Any] = {"MlpPolicy": policies[default], **policies}
+    for alias, policy in policies.items():
+        for prefix, (kind, extractor) in _FORMS.items():
+            attributes = {
+                "default_features_extractor_class": extractor,
+                "__module__": policy.__module__,
+                "__doc__": f":class:`{policy.__name__}` for {kind} observations.",
+            }
+            form = type(f"{prefix}{policy.__name__}", (policy,), attributes)
+            module[form.__name__] = aliases[f"{prefix}{alias}"] = form
+            if alias == default:
+                aliases[f"{prefix}Policy"] = form
+    return aliases
 
 
 def check_observation_space(space: spaces.Space, extractor: type[BaseFeaturesExtractor]) -> None:
-    """Check that SB3's extractors are given what they can read; others know for themselves.
-
-    Raises:
-        ValueError: If the space is a dictionary and the extractor is for arrays, or the reverse.
-
-    Example:
-        >>> check_observation_space(spaces.Dict({}), NatureCNN)
-        Traceback (most recent call last):
-        ...
-        ValueError: observation_space must be no Dict for NatureCNN (Dicts take a MultiInput... ...
-    """
+    """Raise ``ValueError`` if one of SB3's extractors cannot read the observations."""
     is_dict = isinstance(space, spaces.Dict)
-    if is_dict and extractor in (FlattenExtractor, NatureCNN):
-        wanted = "no Dict for"
-    elif not is_dict and extractor is CombinedExtractor:
-        wanted = "a Dict for"
-    else:
-        return
-    raise ValueError(
-        f"observation_space must be {wanted} {extractor.__name__} (Dicts take a MultiInput... "
-        f"policy, all else one without), got {space}"
-    )
-
-
-def _with(
-    policy: type[Policy], prefix: str, kind: str, extractor: type[BaseFeaturesExtractor]
-) -> type[Policy]:
-    attributes: dict[str, Any] = {
-        "default_features_extractor_class": extractor,
-        # Where pickles of a model look for the class.
-        "__module__": policy.__module__,
-        "__doc__": f":class:`{policy.__name__}` for {kind} observations.",
-    }
-    return type(f"{prefix}{policy.__name__}", (policy,), attributes)
+    if extractor in ((FlattenExtractor, NatureCNN) if is_dict else (CombinedExtractor,)):
+        raise ValueError(
+            f"observation_space must {'not ' if is_dict else ''}be a Dict for {extractor.__name__} "
+            f"(only MultiInput... policies take a Dict), got {space}"
+        )

@@ -1,8 +1,7 @@
-"""What our policy classes for SAC, TQC and CrossQ have in common."""
+"""What the policy classes for SAC, TQC and CrossQ have in common."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -13,47 +12,43 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_flowpolicy.distributions.base import positive_int
+from sb3_flowpolicy.distributions.base import is_whole, positive_int
 from sb3_flowpolicy.guard.finite import all_finite, check_observation
 from sb3_flowpolicy.policies.actor import FlowActor
-from sb3_flowpolicy.policies.deterministic import (
-    DETERMINISTIC_DEFAULTS,
-    best_actions,
-    check_settings,
-)
+from sb3_flowpolicy.policies.deterministic import DETERMINISTIC_DEFAULTS, MODES, best_actions
 from sb3_flowpolicy.policies.extractors import check_observation_space
 
 
 class DistributionPolicy(BasePolicy):
     """Mixin for off-policy policy classes: a registered density as the action distribution.
 
-    To be named before ``SACPolicy``, or the class of another algorithm that is built like SAC.
+    Put it before ``SACPolicy``, ``TQCPolicy`` or ``CrossQPolicy`` among the base classes.
 
     Args:
         observation_space: Observation space.
         action_space: Box with finite bounds, of any shape.
         lr_schedule: Learning rate schedule.
-        distribution: Name of a registered density. Default: the policy class's own.
+        distribution: Name of a registered density. Default: that of the policy class.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
-        deterministic_mode: What ``predict(..., deterministic=True)`` does: ``"base"`` takes the
-            image of the base mean, ``"log_prob"`` the most likely of several candidates, ``"q"``
-            the best by the critics. May be set afterwards as well.
+        deterministic_mode: How ``predict(..., deterministic=True)`` chooses an action: ``"base"``
+            takes the image of the base mean, ``"log_prob"`` the most likely of several candidates,
+            ``"q"`` the best according to the critics. Can be changed later.
         deterministic_samples: Number of candidates, at least 2; the base mean is one of them.
-        **policy_kwargs: Everything that the algorithm's own policy class takes: ``net_arch``,
+        **policy_kwargs: Arguments of the algorithm's own policy class: ``net_arch``,
             ``activation_fn``, ``features_extractor_class``, ``optimizer_kwargs``, ``n_critics``,
             ``share_features_extractor``, ...
 
     Raises:
-        ValueError: If the action space is no bounded Box, the density, one of its arguments or
-            the mode is unknown, or ``use_sde=True`` is asked of anything but the diagonal normal
-            distribution (whose actor is then SB3's own). Plain algorithms refuse such an
-            action space themselves, with an ``AssertionError``, before they build the policy.
+        ValueError: If the action space is not a bounded Box; if the density, one of its arguments
+            or the mode is unknown; or if ``use_sde=True`` with any density but the diagonal normal
+            distribution (whose actor is then SB3's own). Algorithms reject such action spaces
+            themselves, with an ``AssertionError``, before they build the policy.
     """
 
     default_distribution: ClassVar[str]
     default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     actor_class: ClassVar[type[FlowActor]] = FlowActor
-    # Of the algorithm's own policy class.
+    # Attributes of the algorithm's own policy class.
     actor: Any
     critic: Any
     actor_kwargs: dict[str, Any]
@@ -72,23 +67,13 @@ class DistributionPolicy(BasePolicy):
         deterministic_samples: int = DETERMINISTIC_DEFAULTS["deterministic_samples"],
         **policy_kwargs: Any,
     ) -> None:
-        bounded = (
+        if not (
             isinstance(action_space, spaces.Box)
             and np.isfinite([action_space.low, action_space.high]).all()
-        )
-        bounded = bounded and (action_space.low < action_space.high).all()
-        if not bounded:
+            and (action_space.low < action_space.high).all()
+        ):
             raise ValueError(
                 f"action_space must be a Box with finite bounds, low < high, got {action_space}"
-            )
-        # Plain attributes before super().__init__(), which builds the actor.
-        self.distribution = self.default_distribution if distribution is None else distribution
-        if not isinstance(distribution_kwargs, Mapping | None):
-            raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
-        self.distribution_kwargs = dict(distribution_kwargs or {})
-        if not all(isinstance(name, str) for name in self.distribution_kwargs):
-            raise ValueError(
-                f"distribution_kwargs must have strings as keys, got {distribution_kwargs!r}"
             )
         check_net_arch(policy_kwargs.get("net_arch"), "qf", both=True)
         for name in {"n_critics", "n_quantiles"} & set(policy_kwargs):
@@ -97,21 +82,18 @@ class DistributionPolicy(BasePolicy):
             "features_extractor_class", self.default_features_extractor_class
         )
         check_observation_space(observation_space, extractor)
-        policies = [base for base in type(self).__mro__ if issubclass(base, BasePolicy)]
-        theirs = next(base for base in policies if not issubclass(base, DistributionPolicy))
-        unknown = sorted(set(policy_kwargs) - set(inspect.signature(theirs).parameters))
-        if unknown:
-            raise ValueError(
-                f"policy_kwargs must be {theirs.__name__}'s, distribution or distribution_kwargs, "
-                f"got {unknown}; arguments of the density go into distribution_kwargs"
-            )
-        if policy_kwargs.get("use_sde") and self.distribution != "gaussian":
-            raise ValueError(
-                "use_sde must be False unless distribution is 'gaussian': gSDE is a linear noise "
-                f"of its own, got use_sde=True with {self.distribution!r}"
-            )
+        # Plain attributes before super().__init__(), which builds the actor.
+        self.distribution = self.default_distribution if distribution is None else distribution
+        self.distribution_kwargs = checked_distribution_kwargs(distribution_kwargs)
         self._uses_sde = bool(policy_kwargs.get("use_sde"))
-        self.deterministic_samples = deterministic_samples
+        if self._uses_sde and self.distribution != "gaussian":
+            raise ValueError(
+                "use_sde must be False unless distribution is 'gaussian', because gSDE replaces "
+                f"the density, got use_sde=True with {self.distribution!r}"
+            )
+        self.deterministic_samples = positive_int(
+            "deterministic_samples", deterministic_samples, least=2
+        )
         self.deterministic_mode = deterministic_mode
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
@@ -134,78 +116,86 @@ class DistributionPolicy(BasePolicy):
 
     @deterministic_mode.setter
     def deterministic_mode(self, mode: str) -> None:
-        check_settings(mode, self.deterministic_samples, self._uses_sde)
+        if mode not in MODES:
+            raise ValueError(f"deterministic_mode must be one of {MODES}, got {mode!r}")
+        if mode != "base" and self._uses_sde:
+            raise ValueError(f'deterministic_mode must be "base" with use_sde=True, got {mode!r}')
         self._deterministic_mode = mode
 
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
+        """Choose actions, as SB3's policies do.
+
+        Raises:
+            ValueError: If an observation or an action is not finite.
+        """
+        actions, state = super().predict(observation, *args, **kwargs)
+        check_observation(observation)
+        check_finite_actions(actions)
+        return actions, state
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        parts = observation if isinstance(observation, dict) else {"": observation}
-        check_observation({key: part.detach().cpu().numpy() for key, part in parts.items()})
-        if deterministic and self.deterministic_mode != "base":
-            assert isinstance(self.actor, FlowActor)  # anything else allows "base" only
-            mode, n_candidates = self.deterministic_mode, self.deterministic_samples
-            actions = best_actions(self.actor, self.critic, observation, mode, n_candidates)
-        else:
-            actions = super()._predict(observation, deterministic)  # type: ignore[safe-super]
-        check_finite_actions(actions.detach().cpu().numpy())
-        return actions
+        if not deterministic or self.deterministic_mode == "base":
+            return super()._predict(observation, deterministic)  # type: ignore[safe-super]
+        mode, n_candidates = self.deterministic_mode, self.deterministic_samples
+        return best_actions(self.actor, self.critic, observation, mode, n_candidates)
 
     def set_training_mode(self, mode: bool) -> None:
-        """Switch batch normalisation and dropout; ``predict`` asks for it at every step."""
+        """Switch batch normalization and dropout; ``predict`` does so at every step."""
         # Walking through all modules each time would take longer than a small network does.
         if not self.training == self.actor.training == self.critic.training == mode:
             super().set_training_mode(mode)
 
     def up_to_date(self, policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-        """Return ``policy_kwargs`` with what was set after construction."""
+        """Return ``policy_kwargs`` with the deterministic settings that were changed later."""
         before = {**DETERMINISTIC_DEFAULTS, **policy_kwargs}
         now = self._deterministic_settings()
-        changed = {name: value for name, value in now.items() if value != before[name]}
-        return {**policy_kwargs, **changed}
+        return {**policy_kwargs, **{k: value for k, value in now.items() if value != before[k]}}
 
     def _deterministic_settings(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in DETERMINISTIC_DEFAULTS}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            distribution=self.distribution,
-            distribution_kwargs=self.distribution_kwargs,
+        return {
+            **super()._get_constructor_parameters(),
+            "distribution": self.distribution,
+            "distribution_kwargs": self.distribution_kwargs,
             **self._deterministic_settings(),
-            # Missing in SB3's: a policy that shares its extractor would load as one that does not.
-            share_features_extractor=self.share_features_extractor,
-        )
-        return data
+            # SB3 omits it: a policy that shares its extractor would be loaded as one that does not.
+            "share_features_extractor": self.share_features_extractor,
+        }
+
+
+def checked_distribution_kwargs(kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the arguments of a density, or raise ``ValueError`` if they are not a dict."""
+    kwargs = {} if kwargs is None else kwargs
+    if not isinstance(kwargs, Mapping) or not all(isinstance(name, str) for name in kwargs):
+        raise ValueError(f"distribution_kwargs must be a dict with strings as keys, got {kwargs!r}")
+    return dict(kwargs)
 
 
 def check_net_arch(net_arch: Any, critic: str, both: bool) -> None:
-    """Check that these are units per layer; torch's messages would not say.
+    """Raise ``ValueError`` unless ``net_arch`` is None or holds the units of each layer.
 
     Args:
-        net_arch: Units of each layer, of actor and critic alike or of each.
-        critic: What the algorithm calls its critic.
-        both: Whether a mapping must tell of both, or may leave one without layers.
-
-    Raises:
-        ValueError: If they are not.
+        net_arch: A list for actor and critic alike, or a mapping with one for each.
+        critic: Key of the critic in the mapping.
+        both: Whether the mapping must have both keys.
     """
-    if net_arch is None:
-        return
-    archs = [net_arch]
-    if isinstance(net_arch, Mapping):
-        keys, known = set(net_arch), {"pi", critic}
-        if keys != known if both else not keys <= known:
-            raise ValueError(f"net_arch must have the keys 'pi' and {critic!r}, got {[*net_arch]}")
-        archs = list(net_arch.values())
-    for arch in archs:
-        if not isinstance(arch, list | tuple):
-            raise ValueError(f"net_arch must be a list of units per layer, got {arch!r}")
-        for units in arch:
-            positive_int("net_arch", units)
+    archs = net_arch if isinstance(net_arch, Mapping) else {"pi": net_arch, critic: net_arch}
+    missing = {"pi", critic} - set(archs) if both else set()
+    if net_arch is not None and (
+        missing
+        or not set(archs) <= {"pi", critic}
+        or not all(isinstance(arch, list | tuple) for arch in archs.values())
+        or not all(is_whole(units) and units >= 1 for arch in archs.values() for units in arch)
+    ):
+        raise ValueError(
+            "net_arch must be a list of units per layer, each at least 1, or a dict of such lists "
+            f"with the keys 'pi' and {critic!r}, got {net_arch!r}"
+        )
 
 
 def check_finite_actions(actions: np.ndarray) -> None:
-    """Raise ``ValueError`` rather than send NaN to an environment, as stock SAC does."""
+    """Raise ``ValueError`` rather than send NaN to an environment."""
     if not all_finite(actions):
-        raise ValueError(
-            "observation and weights must be finite for an action to be, got actions with NaN"
-        )
+        raise ValueError("observation and weights must be finite, got actions with NaN or infinity")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -16,45 +15,47 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
-from sb3_flowpolicy.guard.finite import all_finite
-from sb3_flowpolicy.policies.extractors import check_observation_space, for_dicts, for_images
-from sb3_flowpolicy.policies.off_policy import check_finite_actions, check_net_arch
+from sb3_flowpolicy.policies.extractors import check_observation_space, with_forms
+from sb3_flowpolicy.policies.off_policy import (
+    check_finite_actions,
+    check_net_arch,
+    checked_distribution_kwargs,
+)
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
-# Of SB3's normal distributions, which are not built.
-_NOT_OURS = {"use_sde", "log_std_init", "full_std", "use_expln", "squash_output"}
-# Of the loss, by an action's log-probability. PPO's is advantage times ratio; a larger one says
-# only that the policy has left the actions that it is judged by.
+# Arguments of SB3's Gaussian head, which is not built.
+_UNUSED = {"use_sde", "log_std_init", "full_std", "use_expln", "squash_output"}
+# Bound on the gradient of the loss with respect to a log-probability, which in PPO is advantage
+# times ratio. A larger gradient only says that the policy has left the actions it is judged by.
 _LARGEST_GRADIENT = 1e6
 
 
 class DensityActorCritic(ActorCriticPolicy):
     """Actor-critic policy with a registered density as its action distribution.
 
-    The log-probability of an action is that of the very numbers in the rollout buffer, by the
-    density's inverse, while collecting and while learning. So the ratio of PPO is 1 before the
-    first update, however far an action is saturated (up to rounding, which flows with extreme
-    weights amplify). The entropy bonus is a Monte
-    Carlo estimate whose gradient reaches all parameters of the density.
+    Both while collecting and while learning, the log-probability of an action is computed with the
+    density's inverse from the numbers in the rollout buffer. So PPO's ratio is 1 before the first
+    update, even for saturated actions (up to rounding, which flows with extreme weights amplify).
+    The entropy bonus is a Monte Carlo estimate whose gradient reaches all parameters.
 
     Args:
         observation_space: Observation space.
         action_space: Box of any shape; with finite bounds if ``squash_output``.
         lr_schedule: Learning rate schedule.
-        distribution: Name of a registered density. Default: the policy class's own.
+        distribution: Name of a registered density. Default: that of the policy class.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
-        squash_output: Whether tanh bounds actions, in which case they are rescaled to the action
-            space. Otherwise they are clipped to it, as SB3 does by default.
-        **policy_kwargs: Everything else that SB3's ``ActorCriticPolicy`` takes: ``net_arch``,
+        squash_output: Whether to squash actions with tanh and rescale them to the action space.
+            Otherwise they are clipped to it, as SB3 does by default.
+        **policy_kwargs: Other arguments of SB3's ``ActorCriticPolicy``: ``net_arch``,
             ``activation_fn``, ``ortho_init``, ``features_extractor_class``, ...
 
     Raises:
-        ValueError: If the action space is no Box (with finite bounds), the density or an argument
-            is unknown, or ``use_sde=True``.
+        ValueError: If the action space is not a Box (with finite bounds), the density is unknown,
+            or an argument belongs to SB3's Gaussian head (``use_sde=True``, ``log_std_init``, ...).
 
     References:
-        Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5 on
-        on-policy algorithms as the next to be given these densities.
+        Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5, which
+        proposes these densities for on-policy algorithms.
     """
 
     default_distribution: ClassVar[str]
@@ -74,44 +75,35 @@ class DensityActorCritic(ActorCriticPolicy):
     ) -> None:
         if not isinstance(action_space, spaces.Box):
             raise ValueError(f"action_space must be a Box, got {action_space}")
-        if not isinstance(squash_output, bool):
-            raise ValueError(f"squash_output must be True or False, got {squash_output!r}")
         if squash_output and not np.isfinite([action_space.low, action_space.high]).all():
             raise ValueError(
-                "action_space must have finite bounds for actions to be squashed into, got "
-                f"{action_space}"
+                f"action_space must have finite bounds for squashed actions, got {action_space}"
             )
-        if use_sde:
-            raise ValueError("use_sde must be False: gSDE goes with SB3's own policies, got True")
-        if not isinstance(distribution_kwargs, Mapping | None):
-            raise ValueError(f"distribution_kwargs must be a dict, got {distribution_kwargs!r}")
+        unused = sorted(policy_kwargs.keys() & _UNUSED)
+        if use_sde or unused:
+            raise ValueError(
+                "use_sde must be False and policy_kwargs must not have arguments of SB3's Gaussian "
+                f"head, which the density replaces, got use_sde={use_sde} and {unused}"
+            )
         net_arch = policy_kwargs.get("net_arch")
         if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], Mapping):
-            net_arch = net_arch[0]  # as before SB3 1.8, which still takes it with a warning
+            net_arch = net_arch[0]  # the form before SB3 1.8, which SB3 accepts with a warning
         check_net_arch(net_arch, "vf", both=False)
         extractor = policy_kwargs.setdefault(
             "features_extractor_class", self.default_features_extractor_class
         )
         check_observation_space(observation_space, extractor)
-        bases = [base for base in type(self).__mro__ if issubclass(base, ActorCriticPolicy)]
-        known = {name for base in bases for name in inspect.signature(base).parameters} - _NOT_OURS
-        unknown = sorted(set(policy_kwargs) - known)
-        if unknown:
-            raise ValueError(
-                "policy_kwargs must be ActorCriticPolicy's (but for its normal distribution's), "
-                f"distribution, distribution_kwargs or squash_output, got {unknown}"
-            )
         # Plain attributes before super().__init__(), which builds the networks.
         self.distribution = self.default_distribution if distribution is None else distribution
-        self.distribution_kwargs = dict(distribution_kwargs or {})
+        self.distribution_kwargs = checked_distribution_kwargs(distribution_kwargs)
         self._squashes = squash_output
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
-        # SB3's constructor allows it to gSDE only, though all of SB3 that reads it is ready for us.
+        # SB3's constructor accepts squash_output with gSDE only, but the rest of SB3 supports it.
         self._squash_output = squash_output
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        # The normal heads were initialised with all the rest, and now give way.
+        # The density replaces the Gaussian head that SB3 has built.
         del self.log_std
         size, features = spaces.flatdim(self.action_space), self.mlp_extractor.latent_dim_pi
         density = make_distribution(self.distribution, size, features, **self.distribution_kwargs)
@@ -122,65 +114,68 @@ class DensityActorCritic(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(parameters, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """Return actions, values and log-probabilities, as SB3's.
+        """Return actions, values and log-probabilities, as SB3 does.
 
         Raises:
-            ValueError: If an action is not finite, which has an observation or weights for a cause.
+            ValueError: If an action is not finite, because an observation or a weight is not.
         """
         found = super().forward(*args, **kwargs)
         check_finite_actions(found[0].detach().cpu().numpy())
         return found
 
     def evaluate_actions(self, *args: Any, **kwargs: Any) -> Any:
-        """Return values, log-probabilities and entropies of stored actions, as SB3's.
+        """Return values, log-probabilities and entropies of stored actions, as SB3 does.
 
-        The gradient that comes back through a log-probability is bounded. Close to the edge of the
-        action box float32 has few numbers left, so that a stored action may lie many standard
-        deviations beside the one that was drawn. In a narrow distribution one update can raise its
-        log-probability by a hundred: PPO's ratio is infinite, its gradient NaN.
+        The gradient with respect to a log-probability is bounded. Near the edge of the action box
+        float32 is coarse, so a stored action may lie many standard deviations from the one that was
+        drawn. In a narrow distribution one update can then raise its log-probability by a hundred,
+        which makes PPO's ratio infinite and its gradient NaN.
 
         Raises:
             ValueError: If a log-probability is not finite.
         """
         found = super().evaluate_actions(*args, **kwargs)
-        if not all_finite(found[1].detach().cpu().numpy()):
+        if not found[1].isfinite().all():
             raise ValueError(
-                "observations and weights must be finite to learn from, got log-probabilities "
-                "with NaN or infinity"
+                "observations and weights must be finite, got log-probabilities with NaN or "
+                "infinity"
             )
         if found[1].requires_grad:
             found[1].register_hook(_bounded)
         return found
 
-    def _predict(self, *args: Any, **kwargs: Any) -> Any:
-        found = super()._predict(*args, **kwargs)
-        actions = found[0] if isinstance(found, tuple) else found  # a memory comes along
-        check_finite_actions(actions.detach().cpu().numpy())
-        return found
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        """Choose actions, as SB3's policies do.
+
+        Raises:
+            ValueError: If an action is NaN, because an observation or a weight is not finite.
+        """
+        actions, state = super().predict(*args, **kwargs)
+        check_finite_actions(actions)
+        return actions, state
 
     def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
         return self.action_dist.proba_distribution(latent_pi)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        data = {name: value for name, value in data.items() if name not in _NOT_OURS}
-        data.update(
-            distribution=self.distribution,
-            distribution_kwargs=self.distribution_kwargs,
-            squash_output=self._squashes,
-            # Missing in SB3's: a policy that shares its extractor would load as one that does not.
-            share_features_extractor=self.share_features_extractor,
-        )
-        return data
+        return {
+            **{name: value for name, value in data.items() if name not in _UNUSED},
+            "distribution": self.distribution,
+            "distribution_kwargs": self.distribution_kwargs,
+            "squash_output": self._squashes,
+            # SB3 omits it: a policy that shares its extractor would be loaded as one that does not.
+            "share_features_extractor": self.share_features_extractor,
+        }
 
 
 def _bounded(gradient: th.Tensor) -> th.Tensor:
-    """Bound a gradient; NaN is 0 x infinity, of a ratio that PPO has clipped: no gradient."""
+    """Bound a gradient. NaN, which is 0 times infinity for a ratio that PPO clipped, becomes 0."""
     return gradient.nan_to_num(nan=0.0).clamp(-_LARGEST_GRADIENT, _LARGEST_GRADIENT)
 
 
 class FlowActorCriticPolicy(DensityActorCritic):
-    """Conditional RealNVP for PPO and A2C; the distribution correlates and bends.
+    """Conditional RealNVP for PPO and A2C, for correlated actions and curved densities.
 
     Example:
         >>> from stable_baselines3 import PPO
@@ -194,7 +189,7 @@ class FlowActorCriticPolicy(DensityActorCritic):
 
 
 class LowRankActorCriticPolicy(DensityActorCritic):
-    """Normal distribution with low-rank covariance for PPO and A2C; actions correlate.
+    """Normal distribution with low-rank covariance for PPO and A2C, for correlated actions.
 
     Example:
         >>> from stable_baselines3 import A2C
@@ -205,6 +200,6 @@ class LowRankActorCriticPolicy(DensityActorCritic):
     default_distribution = "low_rank"
 
 
-_POLICIES = (FlowActorCriticPolicy, LowRankActorCriticPolicy)
-CnnFlowActorCriticPolicy, CnnLowRankActorCriticPolicy = for_images(*_POLICIES)
-MultiInputFlowActorCriticPolicy, MultiInputLowRankActorCriticPolicy = for_dicts(*_POLICIES)
+ALIASES = with_forms(
+    globals(), FlowPolicy=FlowActorCriticPolicy, LowRankPolicy=LowRankActorCriticPolicy
+)

@@ -12,16 +12,14 @@ from sb3_flowpolicy.policies.on_policy import FlowActorCriticPolicy
 class FlowLstmPolicy(FlowActorCriticPolicy, RecurrentActorCriticPolicy):
     """:class:`FlowActorCriticPolicy` with the memory of ``RecurrentActorCriticPolicy``.
 
-    Actions are clipped to the action space and not squashed: sb3-contrib's ``RecurrentPPO`` clips
-    whatever it collects, and would not rescale squashed actions.
-
     Args:
         *args: As for :class:`FlowActorCriticPolicy`.
-        squash_output: False.
+        squash_output: False: ``RecurrentPPO`` clips the actions that it collects to the action
+            space and would not rescale squashed ones.
         **kwargs: As for :class:`FlowActorCriticPolicy` and ``RecurrentActorCriticPolicy``.
 
     Raises:
-        ValueError: If ``squash_output`` is anything else.
+        ValueError: If ``squash_output`` is not False.
 
     Example:
         >>> from sb3_contrib import RecurrentPPO
@@ -31,9 +29,9 @@ class FlowLstmPolicy(FlowActorCriticPolicy, RecurrentActorCriticPolicy):
     """
 
     def __init__(self, *args: Any, squash_output: bool = False, **kwargs: Any) -> None:
-        if squash_output is not False:
+        if squash_output:
             raise ValueError(
-                "squash_output must be False, as sb3-contrib's RecurrentPPO does not rescale "
-                f"actions while it collects, got {squash_output!r}"
+                "squash_output must be False, because sb3-contrib's RecurrentPPO does not rescale "
+                f"the actions it collects, got {squash_output!r}"
             )
         super().__init__(*args, squash_output=False, **kwargs)

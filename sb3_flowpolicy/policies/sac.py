@@ -1,15 +1,15 @@
-"""Policy classes for SAC: the same arguments as SB3's, and a few more."""
+"""Policy classes for SAC: SB3's, with a registered density."""
 
 from __future__ import annotations
 
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.policies.extractors import for_dicts, for_images
+from sb3_flowpolicy.policies.extractors import with_forms
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 
 class GaussPolicy(DistributionPolicy, SACPolicy):
-    """Diagonal normal distribution (thesis: Gauss-Agent): stock SAC, on our code.
+    """Diagonal normal distribution (thesis: Gauss-Agent), the policy of stock SAC.
 
     Example:
         >>> from stable_baselines3 import SAC
@@ -20,7 +20,7 @@ class GaussPolicy(DistributionPolicy, SACPolicy):
 
 
 class LowRankPolicy(DistributionPolicy, SACPolicy):
-    """Normal distribution with low-rank covariance (thesis: LR-Agent); actions correlate.
+    """Normal distribution with low-rank covariance (thesis: LR-Agent), for correlated actions.
 
     Example:
         >>> from stable_baselines3 import SAC
@@ -32,7 +32,7 @@ class LowRankPolicy(DistributionPolicy, SACPolicy):
 
 
 class FlowPolicy(DistributionPolicy, SACPolicy):
-    """Conditional RealNVP (thesis: NF-Agent); the distribution correlates and bends.
+    """Conditional RealNVP (thesis: NF-Agent), for correlated actions and curved densities.
 
     Example:
         >>> from stable_baselines3 import SAC
@@ -46,6 +46,11 @@ class FlowPolicy(DistributionPolicy, SACPolicy):
     default_distribution = "realnvp"
 
 
-_POLICIES = (GaussPolicy, LowRankPolicy, FlowPolicy)
-CnnGaussPolicy, CnnLowRankPolicy, CnnFlowPolicy = for_images(*_POLICIES)
-MultiInputGaussPolicy, MultiInputLowRankPolicy, MultiInputFlowPolicy = for_dicts(*_POLICIES)
+ALIASES = with_forms(
+    globals(), FlowPolicy=FlowPolicy, LowRankPolicy=LowRankPolicy, GaussPolicy=GaussPolicy
+)
+_KINDS = ("Flow", "LowRank", "Gauss")
+CnnFlowPolicy, CnnLowRankPolicy, CnnGaussPolicy = (ALIASES[f"Cnn{kind}Policy"] for kind in _KINDS)
+MultiInputFlowPolicy, MultiInputLowRankPolicy, MultiInputGaussPolicy = (
+    ALIASES[f"MultiInput{kind}Policy"] for kind in _KINDS
+)

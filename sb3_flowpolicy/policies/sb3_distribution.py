@@ -1,4 +1,4 @@
-"""Our densities behind the interface that SB3's own code expects of a distribution."""
+"""The interface that SB3's code expects of a distribution, for our densities."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from stable_baselines3.common.distributions import Distribution
 
 from sb3_flowpolicy.distributions import ActionDistribution
 
-# PPO asks for the entropy of whole minibatches, over which the estimate's noise averages out.
+# PPO averages the entropy over a minibatch, so a few samples per observation are enough.
 ENTROPY_PAIRS = 2
 
 
@@ -15,7 +15,7 @@ class ActionDistributionAdapter(Distribution):
     """An :class:`ActionDistribution` as an SB3 ``Distribution``; its one parameter is the context.
 
     Args:
-        density: The density, usually squashed; its weights stay its own.
+        density: The density, usually squashed. It is not copied.
 
     Example:
         >>> import torch as th
@@ -47,16 +47,15 @@ class ActionDistributionAdapter(Distribution):
     def entropy(self) -> th.Tensor:
         """Estimate the entropy by Monte Carlo, with gradient: shape (batch,).
 
-        There is no closed form for squashed or bent densities. Noise comes in pairs of opposite
-        sign, so that what is odd in it cancels.
+        Squashed densities and flows have no closed form. Noise is drawn in pairs of opposite sign,
+        which cancels the terms of the error that are odd in it.
         """
         context = self._conditioned()
-        noise = self._draw_noise(ENTROPY_PAIRS)
-        noise = th.cat([noise, -noise])
-        return -self.density.rsample_and_log_prob(context, noise)[1].mean(0)
+        noise = self.density.draw_noise(context, ENTROPY_PAIRS)
+        return -self.density.rsample_and_log_prob(context, th.cat([noise, -noise]))[1].mean(0)
 
     def sample(self) -> th.Tensor:
-        """Draw a reparametrised sample, shape (batch, D)."""
+        """Draw a reparametrized sample, shape (batch, D)."""
         return self._sample_and_log_prob()[0]
 
     def mode(self) -> th.Tensor:
@@ -72,12 +71,8 @@ class ActionDistributionAdapter(Distribution):
         return self.proba_distribution(context)._sample_and_log_prob()
 
     def _sample_and_log_prob(self) -> tuple[th.Tensor, th.Tensor]:
-        return self.density.rsample_and_log_prob(self._conditioned(), self._draw_noise())
-
-    def _draw_noise(self, *sample_shape: int) -> th.Tensor:
         context = self._conditioned()
-        shape = (*sample_shape, *context.shape[:-1], self.density.noise_dim)
-        return th.randn(shape, dtype=context.dtype, device=context.device)
+        return self.density.rsample_and_log_prob(context, self.density.draw_noise(context))
 
     def _conditioned(self) -> th.Tensor:
         if self.context is None:

@@ -1,7 +1,7 @@
 """An off-policy algorithm of SB3's kind gets everything ours have from one small class.
 
-In the package that is one file in ``algorithms/``, its policies in ``policies/`` if they differ from
-SAC's, a line in ``sb3_flowpolicy/__init__.py`` and a line in ``zoo/registration.py``.
+In the package that is one file in ``algorithms/``, one in ``policies/`` unless SAC's will do, a
+line in ``sb3_flowpolicy/__init__.py`` and a line in ``zoo/registration.py``.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def test_it_is_guarded_and_its_arguments_are_checked() -> None:
         CautiousSACFlow("FlowPolicy", Faulty("rewards", np.nan), **FAST).learn(40)
     with pytest.raises(ValueError, match="caution must be at most 1, got 2"):
         CautiousSACFlow("FlowPolicy", ENV, caution=2, **FAST)
-    with pytest.raises(ValueError, match="policy must be one of .* or a SACPolicy, got 'NoPolicy'"):
+    with pytest.raises(ValueError, match=r"must be one of .* or a SACPolicy, got 'NoPolicy'"):
         CautiousSACFlow("NoPolicy", ENV, **FAST)
 
 

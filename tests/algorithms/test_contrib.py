@@ -182,7 +182,7 @@ def test_good_arguments_of_ppo() -> None:
 
 @pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow, CrossQFlow, PPOFlow])
 def test_policies_of_other_observations(algorithm: Any) -> None:
-    with pytest.raises(ValueError, match=r"observation_space must be no Dict .* MultiInput"):
+    with pytest.raises(ValueError, match=r"observation_space must not be a Dict .* MultiInput"):
         algorithm("FlowPolicy", SimpleMultiObsEnv(discrete_actions=False))
     if algorithm is not CrossQFlow:
         with pytest.raises(ValueError, match="observation_space must be a Dict for Combined"):

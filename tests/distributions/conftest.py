@@ -1,4 +1,4 @@
-"""Every registered density, in every dimension the tests care about."""
+"""All registered densities in several dimensions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CONTEXT_DIM = 5
 
 
 def build(name: str, action_dim: int, dtype: th.dtype = th.float64) -> ActionDistribution:
-    """Build a density whose parameters are random: an identity flow would prove nothing."""
+    """Build a density with random parameters, because an identity flow would prove nothing."""
     th.manual_seed(action_dim)
     density = make_distribution(name, action_dim, CONTEXT_DIM).to(dtype)
     with th.no_grad():

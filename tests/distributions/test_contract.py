@@ -1,4 +1,4 @@
-"""What every registered density has to keep, whoever wrote it."""
+"""The contract of every registered density, including those of third parties."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_density_integrates_to_one(name: str, dim: int, squashed: bool, context:
     axis = th.linspace(-14, 14, 2801 if dim == 1 else 1201, dtype=th.float64)
     points = th.cartesian_prod(*[axis] * dim).reshape(-1, dim)
     if squashed:
-        # Substitute a = tanh(v), so that the grid reaches into the corners of the box.
+        # The substitution a = tanh(v) makes the grid dense in the corners of the box.
         inside = points.abs().max(-1).values < 9
         points = points[inside]
         log_volume = 2 * points.cosh().log().sum(-1)
@@ -70,7 +70,7 @@ def test_squashed_log_prob_is_the_change_of_variables(
         u, base_log_prob = density.rsample_and_log_prob(context, noise)
         action, log_prob = squashed.rsample_and_log_prob(context, noise)
         jacobian = th.autograd.functional.jacobian(th.tanh, u).diagonal()
-        # Beyond |u| = 8 it is the reference, 1 - tanh(u)^2, that loses its digits.
+        # Beyond |u| = 8 the reference, 1 - tanh(u)^2, loses its digits.
         log_jacobian = th.where(u.abs() < 8, jacobian.log(), -2 * u.cosh().log())
         expected = base_log_prob - log_jacobian.sum()
         assert th.equal(action, u.tanh())
@@ -101,7 +101,7 @@ def test_noise_broadcasts_against_context(density: ActionDistribution) -> None:
     th.testing.assert_close(u[5, 2], one_u)
     th.testing.assert_close(log_prob[5, 2], one_log_prob)
     th.testing.assert_close(density.log_prob(context, u), log_prob, rtol=1e-8, atol=1e-6)
-    # ... and the other way round: one noise, many contexts.
+    # One noise, many contexts.
     wide_u, wide_log_prob = density.rsample_and_log_prob(context, noise[0, 0])
     assert wide_u.shape == (4, density.action_dim)
     assert wide_log_prob.shape == (4,)
@@ -162,7 +162,7 @@ def test_scores_of_unlikely_actions_stay_finite(density: ActionDistribution, sca
 
 
 def test_same_numbers_stacked_over_seeds(density: ActionDistribution) -> None:
-    """What SeedBatch relies on: parameters, context and noise may carry a leading axis."""
+    """Parameters, context and noise may have a leading axis, as SeedBatch requires."""
     name = next(n for n, c in registered_distributions().items() if c is type(density))
     members = [density, build(name, density.action_dim)]
     with th.no_grad():

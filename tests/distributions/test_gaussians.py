@@ -1,4 +1,4 @@
-"""The three normal distributions against torch's own, and at the edge of float32."""
+"""The three normal distributions against torch's, and near the limits of float32."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_low_rank_equals_torch(dim: int, rank: int) -> None:
     )
 
 
-def test_low_rank_samples_have_the_covariance_they_claim(context: th.Tensor) -> None:
+def test_low_rank_samples_have_the_covariance(context: th.Tensor) -> None:
     density = build("low_rank", 3)
     assert isinstance(density, LowRankGaussian)
     _, log_std, columns = density.covariance_factors(context)
@@ -64,7 +64,7 @@ def test_low_rank_samples_have_the_covariance_they_claim(context: th.Tensor) -> 
 @pytest.mark.parametrize("dim", [2, 8, 17])
 @pytest.mark.parametrize("parallel", [True, False])
 def test_low_rank_survives_both_bounds_at_once(dim: int, parallel: bool) -> None:
-    """Sigma as small as it gets, V as large, its columns as parallel as they come."""
+    """The smallest sigma and the largest V, with parallel columns."""
     density = LowRankGaussian(dim, CONTEXT_DIM)
     with th.no_grad():
         for parameter in density.parameters():
@@ -90,7 +90,7 @@ def test_low_rank_defaults_to_rank_two_and_fits_one_dimension() -> None:
     assert LowRankGaussian(1, 3).rank == 1
 
 
-def test_low_rank_refuses_more_rank_than_dimensions() -> None:
+def test_low_rank_refuses_a_rank_above_the_dimension() -> None:
     with pytest.raises(ValueError, match="rank must be at most action_dim = 2, got 3"):
         LowRankGaussian(2, 3, rank=3)
     with pytest.raises(ValueError, match="rank must be an integer >= 1, got 0"):
@@ -107,7 +107,7 @@ def test_full_covariance_equals_torch(dim: int, context: th.Tensor) -> None:
     peer = MultivariateNormal(loc, scale_tril=scale_tril)
     u = th.randn(10, dim, dtype=th.float64)
     th.testing.assert_close(density.log_prob(context, u), peer.log_prob(u), rtol=1e-8, atol=1e-6)
-    # log_std means what it means for the diagonal kind: the marginal standard deviation.
+    # log_std is the marginal standard deviation, as in DiagGaussian.
     th.testing.assert_close(peer.covariance_matrix.diagonal().sqrt(), log_std.exp())
 
 

@@ -1,4 +1,4 @@
-"""Lattice against torch's normal distribution, against its own definition, and at its bounds."""
+"""Lattice against torch's normal distribution, its definition, and at its bounds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.distributions.conftest import CONTEXT_DIM, DIMS, build
 
 
 def stds(density: Lattice, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """Standard deviations of the features' and of the actions' noise."""
+    """Standard deviations of the noise of features and of actions."""
     latent = _bounded(density.latent_log_std(context)).exp()
     return density.alpha * latent, density.loc_and_log_std(context)[1].exp()
 
@@ -75,7 +75,7 @@ def test_exploration_shapes_the_layer_that_computes_the_mean() -> None:
 @pytest.mark.parametrize("dim", [2, 8, 17])
 @pytest.mark.parametrize("size", [1.0, 10.0, 1e6])
 def test_survives_parallel_rows_and_no_noise_of_the_actions_own(dim: int, size: float) -> None:
-    """A covariance of rank one, but for the smallest standard deviations that there can be."""
+    """A covariance of rank one up to the smallest possible standard deviations."""
     density = Lattice(dim, CONTEXT_DIM)
     with th.no_grad():
         for parameter in density.parameters():
@@ -89,7 +89,7 @@ def test_survives_parallel_rows_and_no_noise_of_the_actions_own(dim: int, size: 
     assert u.isfinite().all()
     assert all(p.grad is None or p.grad.isfinite().all() for p in density.parameters())
     assert density.log_prob(context, u.detach()).isfinite().all()
-    # det(a^2 1 1^T + s^2 I) = s^2D (1 + D a^2 / s^2): known to as many digits as float64 leaves.
+    # det(a^2 1 1^T + s^2 I) = s^2D (1 + D a^2 / s^2), up to the rounding of float64.
     factor = CONTEXT_DIM * size**2 * th.tensor(2 * LOG_STD_MAX, dtype=th.float64).exp()
     ratio = factor * th.tensor(-2 * LOG_STD_MIN, dtype=th.float64).exp()
     half_log_det = dim * LOG_STD_MIN + 0.5 * th.log1p(dim * ratio)

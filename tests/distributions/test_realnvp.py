@@ -1,4 +1,4 @@
-"""RealNVP against an independent flow library, and the parts it is made of."""
+"""RealNVP against an independent flow library, and its parts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.distributions.conftest import CONTEXT_DIM, build
 
 
 def as_zuko(flow: RealNVP) -> list[GeneralCouplingTransform]:
-    """The same couplings, weight by weight, as transforms of zuko, from noise to action."""
+    """Build the same couplings, weight by weight, from zuko's transforms, from noise to action."""
     slope = math.exp(-LOG_SCALE_BOUND)
     weights = flow.context_proj.weight.chunk(flow.layers)
     biases = flow.context_proj.bias.chunk(flow.layers)
@@ -40,7 +40,7 @@ def as_zuko(flow: RealNVP) -> list[GeneralCouplingTransform]:
             layer = len(transforms)
             active = flow.action_dim - len(read)
             with th.no_grad():
-                # Ours orders the halves, theirs the coordinates: sort the columns that read.
+                # We order by halves, zuko by coordinates: sort the input columns.
                 by_coordinate = th.tensor(read).argsort()
                 assert coupling.first is not None
                 first = coupling.first.weight[:, by_coordinate]
@@ -49,7 +49,7 @@ def as_zuko(flow: RealNVP) -> list[GeneralCouplingTransform]:
                 between = [m for m in coupling.between if isinstance(m, th.nn.Linear)]
                 for theirs, ours in zip(linears[1:-1], between, strict=True):
                     theirs.load_state_dict(ours.state_dict())
-                # Theirs interleaves (shift, scale) per coordinate.
+                # zuko interleaves (shift, scale) per coordinate.
                 moved = th.tensor([i for i in order if i not in read]).argsort()
                 rows = th.stack([moved, moved + active], dim=1).flatten()
                 linears[-1].weight.copy_(coupling.last.weight[rows])
@@ -101,7 +101,7 @@ def test_every_shape_inverts(dim: int, layers: int, hidden: tuple[int, ...]) -> 
 
 
 def test_the_flow_bends_where_a_normal_cannot() -> None:
-    """Fitted to a parabola, the flow must beat the best normal distribution by far."""
+    """Fitted to a parabola, the flow is far better than the best normal distribution."""
     th.manual_seed(0)
     x = th.randn(2000, 1)
     data = th.cat([x, x.square() + 0.1 * th.randn(2000, 1)], dim=1)

@@ -1,4 +1,4 @@
-"""Names for densities: what is known, what is refused, what a third party can add."""
+"""The registry: known names, refusals, and densities of third parties."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_kwargs_reach_the_density() -> None:
 def test_register_and_build(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "_REGISTRY", registered_distributions())
     register_distribution("mine", Mine)
-    register_distribution("mine", Mine)  # importing a plug-in twice is fine
+    register_distribution("mine", Mine)  # registering twice is allowed
     assert type(make_distribution("mine", 2, 3)) is Mine
 
 

@@ -1,4 +1,4 @@
-"""The spline flow against an independent library, and its splines at their edges."""
+"""The spline flow against an independent library, and its splines at knots and edges."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ def test_splines_rise_invert_and_stay_within(
     back, _ = ours.move_back(moved, raw)
     assert ladj.isfinite().all()
     assert moved.abs().item() <= BOUND * (1 + 1e-6)
-    # How far rounding of a point in between carries when it is undone.
+    # The effect on the inverse of rounding a point in between.
     carried = 1 + (-ladj).exp().item()
     slack = 1e-5 if dtype == th.float32 else 1e-12
     assert abs(back.item() - x.item()) <= slack * carried * BOUND
 
 
 def test_knots_and_edges_belong_to_the_curve() -> None:
-    """Just beside a knot the spline is where it is on the knot, and its slope is the same."""
+    """The spline and its slope are continuous at knots."""
     raw = outputs(1, 6, 1, 2.0)
     ours = coupling(1, 6)
     grid = th.linspace(-BOUND - 0.1, BOUND + 0.1, 200_001, dtype=th.float64).unsqueeze(-1)
@@ -90,7 +90,7 @@ def test_ends_are_fixed_and_beyond_them_nothing_moves() -> None:
 
 @pytest.mark.parametrize("scale", [1e2, 1e10, 1e30])
 def test_extreme_outputs_leave_numbers(scale: float) -> None:
-    """Slopes that jump between their bounds, in float32; points on both sides of each knot."""
+    """Slopes alternate between their bounds, in float32; points on both sides of each knot."""
     bins = 8
     raw = outputs(1, bins, 5000, scale).float().requires_grad_()
     ours = coupling(1, bins)
@@ -132,7 +132,7 @@ def test_every_shape_inverts(dim: int, layers: int) -> None:
 
 
 def test_one_dimension_can_have_two_modes() -> None:
-    """Fitted to two peaks, it must beat the best normal distribution by far."""
+    """Fitted to two peaks, the flow is far better than the best normal distribution."""
     th.manual_seed(0)
     data = 2 * th.randint(0, 2, (2000, 1)) - 1 + 0.2 * th.randn(2000, 1)
     normal = th.distributions.Normal(data.mean(), data.std()).log_prob(data).mean().item()

@@ -3,5 +3,5 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def headless(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows of the "human" mode open nowhere."""
+    """Give the "human" mode a dummy display."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")

@@ -1,4 +1,4 @@
-"""What every environment of the package has to fulfil; a new id is tested by being registered."""
+"""Tests of every registered environment of the package."""
 
 import copy
 import hashlib
@@ -17,20 +17,20 @@ from flowpolicy_envs.registration import SQUARE_IDS, TUNNEL_IDS
 IDS = [*TUNNEL_IDS, *SQUARE_IDS]
 STILL = {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0}
 NOISY = {"observation_noise": 0.01}
-# Arguments with which episodes differ, and with which they are alike.
+# Arguments that make episodes differ, and that make them equal.
 RANDOM = {**{i: {"start_noise": 0.1} for i in TUNNEL_IDS}, **dict.fromkeys(SQUARE_IDS, NOISY)}
 FIXED = {**{i: {} for i in TUNNEL_IDS}, **dict.fromkeys(SQUARE_IDS, STILL)}
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_gymnasium_has_nothing_to_object(env_id):
+def test_gymnasiums_checker_passes(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gym.make(env_id).unwrapped)
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_stable_baselines3_has_nothing_to_object(env_id):
+def test_stable_baselines3s_checker_passes(env_id):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -50,7 +50,7 @@ def rollout(env: gym.Env, steps: int, rng: np.random.Generator) -> list[tuple]:
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("env_id", IDS)
-def test_copies_go_on_alike_and_independently(env_id, clone):
+def test_copies_continue_equally_and_independently(env_id, clone):
     env = gym.make(env_id, **RANDOM[env_id], render_mode="rgb_array", render_size=32)
     env.reset(seed=3)
     rollout(env, 10, np.random.default_rng(0))
@@ -77,7 +77,7 @@ def test_another_process_sees_the_same_numbers():
     command = [sys.executable, "-c", program, __file__, *IDS]
     run = subprocess.run(command, capture_output=True, check=True, text=True)
     assert run.stdout.split() == [fingerprint(env_id) for env_id in IDS]
-    # Tunnel-v0 is the diagonal and Square-v0 the holding task by default; all others differ.
+    # Tunnel-v0 is the diagonal and Square-v0 the holding task by default. All others differ.
     assert len(set(run.stdout.split())) == len(IDS) - 2
 
 

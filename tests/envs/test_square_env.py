@@ -1,4 +1,4 @@
-"""What the environment promises to agents: holding, moving, rewards, metrics, states."""
+"""The Square for agents: holding, moving, rewards, metrics, states."""
 
 import gymnasium as gym
 import numpy as np
@@ -29,7 +29,7 @@ def play(env_id, act, count, steps, **kwargs):
     return returns, lengths, batch
 
 
-def test_the_holder_holds_and_is_paid():
+def test_the_holder_holds_and_is_rewarded():
     action = Holder()(np.zeros((100, 42)))
     returns, lengths, batch = play("SquareHold-v0", lambda *_: action, 100, 40)
     assert (lengths == 40).all()
@@ -62,7 +62,7 @@ def test_joint_moves_carry_the_square(max_force):
     [
         (1.95, [0, 2], 0.0),
         (1.95, [1, 3], 0.0),
-        (1.95, [0, 1, 2], 0.1),  # a tilted square lets the clipped axes add up a little
+        (1.95, [0, 1, 2], 0.1),  # on a tilted square the clipped axes add up slightly
         (1.95, [0, 1, 2, 3], 1.0),
         (2.4, [0, 2], 0.0),
         (2.4, [0, 1, 2, 3], 1.0),
@@ -80,7 +80,7 @@ def test_how_many_fingers_it_takes(max_force, fingers, holds):
 
 
 def test_joint_noise_is_survived_where_independent_noise_is_not():
-    """The reason for this environment: at equal noise, coordinated fingers keep the square."""
+    """At equal noise, only coordinated fingers keep the square."""
 
     def independent(_, count, rng):
         return 0.65 * INWARDS + 0.15 * rng.standard_normal((count, 8))
@@ -104,7 +104,7 @@ def step_once(task, action, **state):
 
 def test_terms_of_the_holding_reward():
     coefficients = {"held": 0.0, "failure": 0.0, "angle": 0.0, "position": 0.0, "overreach": 0.0}
-    away = -1.0 * INWARDS  # fingers keep off the square, so that it rests where it is put
+    away = -1.0 * INWARDS  # fingers stay away from the square, so that it does not move
     body = [0.12, -0.05, 0.2, 0.0, 0.0, 0.0]
     for name, expected in (
         ("held", 1.0),
@@ -122,7 +122,7 @@ def test_terms_of_the_moving_reward():
     nothing = {"held": 0.0, "failure": 0.0, "effort": 0.0, "position": 0.0, "y": 0.0}
     _, (_, reward, *_) = step_once(Move(**{**nothing, "y": 1.0}), np.zeros(8), bodies=body)
     assert reward == pytest.approx(-0.05)
-    # After the warm-up the position costs nothing; the controllers' stretch does.
+    # After the warm-up the position has no cost, but the effort has.
     env, (_, reward, *_) = step_once(
         Move(**{**nothing, "position": 1.0, "effort": 1.0}), 0.6 * INWARDS
     )
@@ -147,7 +147,7 @@ def test_dropping_costs_and_ends_after_the_warm_up_only():
 def test_a_finger_pushed_out_of_its_reach_breaks():
     env = SquareEnv(**STILL, warm_up=10.0)
     env.reset(seed=0)
-    # The square comes flying and meets the finger on the right at the edge of its reach.
+    # The moving square hits the finger on the right at the edge of its reach.
     env.set_state(
         {
             "bodies": [0.45, 0.0, 0.0, 4.0, 0.0, 0.0],
@@ -159,7 +159,7 @@ def test_a_finger_pushed_out_of_its_reach_breaks():
     assert info["end_reason"] == "broken"
 
 
-def test_the_goal_is_hidden_paid_once_and_remembered():
+def test_the_goal_is_hidden_rewarded_once_and_remembered():
     task = FindGoal(held=0.0, effort=0.0, failure=0.0, goal=3.0)
     env = SquareEnv(task, **STILL, warm_up=0.25, weight=0.0)
     env.reset(seed=0)
@@ -221,14 +221,14 @@ def test_what_is_observed_can_be_chosen():
     assert np.array_equal(chosen, np.tile(everything[[2, 3, 20]], 3))
 
 
-def test_observation_noise_is_as_wide_as_asked_for():
+def test_observation_noise_has_its_standard_deviation():
     env = SquareEnv(**STILL, stack=1, observation_noise={"position": 0.05})
     seen = np.array([env.reset(seed=seed)[0] for seed in range(500)])
     assert seen[:, :2].std() == pytest.approx(0.05, rel=0.1)
     assert (seen[:, 2:] == seen[0, 2:]).all()
 
 
-def test_intervals_are_drawn_anew_for_each_episode():
+def test_each_episode_draws_from_intervals():
     env = SquareEnv(weight=[2.0, 4.0], size=[0.5, 0.6], kd=[0.3, 0.4])
     drawn = []
     for seed in range(200):
@@ -285,7 +285,7 @@ def test_bad_states_and_actions_are_rejected_and_change_nothing():
         assert np.array_equal(value, before[name]), name
 
 
-def test_holder_adds_noise_when_asked():
+def test_holder_adds_noise():
     noisy, again = Holder(noise=0.1, seed=3), Holder(noise=0.1, seed=3)
     actions = noisy(np.zeros((500, 42)))
     assert np.array_equal(actions, again(np.zeros((500, 42))))

@@ -1,4 +1,4 @@
-"""The mechanics: conservation, passivity, convergence, symmetry, and staying finite."""
+"""The mechanics: conservation, passivity, convergence, symmetry, finite values."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ STILL = {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0
 
 
 class World:
-    """One Square without an agent: set its state, take substeps, look at the forces."""
+    """One Square without an agent: set its state, take substeps, inspect the forces."""
 
     def __init__(self, dt: float = DT, **constants: float) -> None:
         batch = SquareBatch(SquareConfig(**{**STILL, "dt": dt, **constants}), 1)
@@ -38,7 +38,7 @@ class World:
         )
 
     def randomise(self, rng: np.random.Generator) -> None:
-        """Any pose, speeds far beyond those of play, fingers anywhere outside of the square."""
+        """Any pose, speeds far above those of episodes, fingers anywhere outside the square."""
         self.body[:] = rng.uniform(-1, 1, 6) * (0.3, 0.3, np.pi, 3.0, 3.0, 10.0)
         self.targets[:] = PLACES + rng.uniform(-0.4, 0.4, (4, 2))
         for k in range(4):
@@ -59,7 +59,7 @@ class World:
         return 0.5 * (mass * (self.body[3:5] ** 2).sum() + inertia * self.body[5] ** 2)
 
     def stored_energy(self) -> float:
-        """What is in the controllers' springs, whose force ends growing at the limit."""
+        """Energy stored by the controllers, which are springs with limited force."""
         stiffness, limit = self.constants[[kernels.STIFFNESS, kernels.MAX_FORCE]]
         stretch = np.abs(self.targets - self.fingers)
         bounded = np.minimum(stretch, limit / stiffness)
@@ -67,7 +67,7 @@ class World:
 
 
 def test_contact_never_creates_energy():
-    """Without controllers, nothing the fingers do may speed the square up."""
+    """Without controllers, fingers never accelerate the square."""
     rng, world = np.random.default_rng(0), World(kp=0.0)
     world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]] = 0.0
     touched = 0
@@ -81,8 +81,8 @@ def test_contact_never_creates_energy():
     assert touched > 5000
 
 
-def test_controllers_give_no_more_than_they_have_stored():
-    """With targets that rest, kinetic and stored energy together can only shrink."""
+def test_controllers_release_no_more_than_they_stored():
+    """With constant targets, the sum of kinetic and stored energy never grows."""
     rng, world = np.random.default_rng(1), World()
     world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]] = 0.0
     for _ in range(1500):
@@ -94,7 +94,7 @@ def test_controllers_give_no_more_than_they_have_stored():
             assert after <= before * (1 + 1e-12)
 
 
-def test_momentum_is_what_contact_forces_and_damping_give():
+def test_momentum_changes_by_contact_forces_and_damping():
     rng, world = np.random.default_rng(2), World()
     mass, inertia = world.constants[[kernels.MASS, kernels.INERTIA]]
     linear, angular = world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]]
@@ -116,8 +116,8 @@ def test_momentum_is_what_contact_forces_and_damping_give():
             assert (np.abs(world.forces[:, 1]) <= limit + 1e-12).all()
 
 
-def test_a_finger_feels_what_it_does():
-    """Drag times velocity is the controller's force less the contact's: action is reaction."""
+def test_fingers_feel_the_reaction():
+    """Drag times velocity is the force of the controller minus the contact force."""
     world = World(max_force=6.0)
     world.body[:3] = 0.05, -0.02, 0.08
     world.targets[:] = 0.5 * PLACES
@@ -129,7 +129,7 @@ def test_a_finger_feels_what_it_does():
         world.substep()
         velocity = (world.fingers - old) / DT
         residual = controller - world.forces[:, 2:] - drag * velocity
-        # At its top speed a finger has force to spare, and on arrival only a part of the substep.
+        # Excluded: fingers at top speed, whose force is limited, and arriving ones.
         slow = (world.forces[:, 0] > 0.0) & (np.abs(velocity).max(axis=1) < 0.3) & (gaps < 1e-6)
         assert np.abs(residual[slow]).max(initial=0.0) < 0.05
         checked += int(slow.sum())
@@ -146,7 +146,7 @@ def test_fingers_stay_outside():
                 assert world.gaps().min() > -0.01
 
 
-def test_a_resting_grip_presses_with_the_controllers_force():
+def test_a_resting_grip_presses_with_the_force_of_the_controllers():
     world = World()
     world.targets[:] = 0.25 * PLACES
     for _ in range(300):
@@ -157,8 +157,8 @@ def test_a_resting_grip_presses_with_the_controllers_force():
     assert np.abs(world.body).max() < 1e-9
 
 
-def test_friction_carries_along_up_to_its_limit():
-    """Two fingers on opposite sides pull the square sideways, with mu times their pressure."""
+def test_friction_carries_up_to_its_limit():
+    """Two fingers on opposite sides pull the square sideways with mu times their pressure."""
     world = World(friction=0.5, linear_damping=0.0)
     world.targets[[1, 3]] = (0.2, 0.2), (0.2, -0.2)
     for _ in range(18):
@@ -197,7 +197,7 @@ def test_a_million_random_substeps_stay_finite_and_bounded():
         assert np.abs(batch.bodies[:, 3:5]).max() < 5.0
         assert np.abs(batch.bodies[:, 5]).max() < 60.0
         assert np.abs(batch.fingers).max() < 1.5
-        # Broken worlds would stop early.
+        # Broken worlds stop early.
         batch.reset(batch.terminated, generators.__getitem__)
     assert 400 * 100 * config.substeps == 1_000_000
 
@@ -240,7 +240,7 @@ def test_a_mirrored_action_sequence_gives_the_mirrored_trajectory():
     rng = np.random.default_rng(5)
     actions = [0.6 * INWARDS + rng.normal(0.0, 0.4, 8) for _ in range(40)]
     plain = trajectory(25, actions, (0.02, -0.01, 0.07))
-    # In the mirror x changes its sign, right and left change places.
+    # Mirroring changes the sign of x and swaps right and left.
     flip = np.array([4, 5, 2, 3, 0, 1, 6, 7])
     signs = np.array([-1.0, 1.0] * 4)
     mirrored = trajectory(25, [(a * signs)[flip] for a in actions], (-0.02, -0.01, -0.07))

@@ -4,7 +4,7 @@ import pytest
 
 from flowpolicy_envs import Holder, SquareEnv
 from flowpolicy_envs.registration import SQUARE_IDS
-from flowpolicy_envs.square.rendering import COLOURS
+from flowpolicy_envs.square.rendering import COLORS
 
 STILL = {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0}
 VIEW = 1.04
@@ -23,9 +23,9 @@ def test_square_fingers_lamp_and_samples_are_where_they_should_be(env_id):
     assert frame.shape == (600, 600, 3)
     assert frame.dtype == np.uint8
     assert pixel(frame, 0.22, -0.22).max() < 40
-    for colour, place in zip(COLOURS, ((0.4, 0), (0, 0.4), (-0.4, 0), (0, -0.4)), strict=True):
-        assert np.abs(pixel(frame, *place).astype(int) - colour).max() < 8
-    assert np.ptp(pixel(frame, 0.9, 0.9).astype(int)) < 5  # a grey lamp: not held
+    for color, place in zip(COLORS, ((0.4, 0), (0, 0.4), (-0.4, 0), (0, -0.4)), strict=True):
+        assert np.abs(pixel(frame, *place).astype(int) - color).max() < 8
+    assert np.ptp(pixel(frame, 0.9, 0.9).astype(int)) < 5  # a gray lamp: not held
     samples = np.zeros((1, 8))
     samples[0, :2] = -0.5, 0.5
     env.set_action_samples(samples)

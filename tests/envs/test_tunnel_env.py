@@ -25,7 +25,7 @@ def test_seven_precise_steps_solve_the_lines_and_six_do_not(env_id, action):
 
 
 def annulus(config: TunnelConfig, n_radii: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the shorter way and a bit, and their angles in degrees."""
+    """Points of a little more than the shorter way, and their angles in degrees."""
     half = config.width / 2
     radii = np.linspace(config.radius - half, config.radius + half, n_radii)
     degrees = np.arange(-135.0, 10.0, spacing)
@@ -61,8 +61,8 @@ def test_circle_takes_six_steps_at_least(env_id):
     env = gym.make(env_id)
     config = env.unwrapped.config
 
-    # Whatever an agent does, rounding its positions to the grid gives a way for which the reach
-    # is longer by two rounding errors. If that way needs six steps, so does the agent.
+    # Rounding the positions of any agent to the grid gives a path with a reach that is longer by
+    # two rounding errors. If such a path needs six steps, so does the agent.
     points, degrees = annulus(config, n_radii=9, spacing=0.25)
     rounding = math.hypot(config.width / 16, np.deg2rad(0.125) * (0.7 + config.width / 2))
     blurred = search(points, degrees <= -111 + 0.125, config.reach + 2 * rounding)
@@ -70,12 +70,12 @@ def test_circle_takes_six_steps_at_least(env_id):
 
     points, degrees = annulus(config, n_radii=9, spacing=0.5)
     shrink = 1e-6  # keeps rounding from pushing the agent through the wall
-    centred = points * (1 + shrink * np.sign(0.7 - np.hypot(*points.T)))[:, None]
-    way = search(centred, degrees <= -111.5, config.reach)
+    centered = points * (1 + shrink * np.sign(0.7 - np.hypot(*points.T)))[:, None]
+    way = search(centered, degrees <= -111.5, config.reach)
     assert len(way) == 6
     env.reset(seed=0)
     for k in way:
-        action = (centred[k] - env.unwrapped.position) / config.reach
+        action = (centered[k] - env.unwrapped.position) / config.reach
         _, _, terminated, _, info = env.step(action)
         assert terminated == (k == way[-1])
     assert info["is_success"]
@@ -136,7 +136,7 @@ def test_rewards_combine():
     assert observation.tolist() == [0.5, 0.5]
 
 
-def test_dense_rewards_add_up_to_the_way_along_the_circle():
+def test_dense_rewards_add_up_to_the_length_along_the_circle():
     env = gym.make("TunnelCircle-v0").unwrapped
     path = env.config.geometry
     total, arc = 0.0, 0.0
@@ -183,7 +183,7 @@ def test_actions_are_clipped(action):
 
 @pytest.mark.parametrize("dims", [{"coupled_dims": 1}, {"coupled_dims": 2}])
 def test_the_far_end_of_the_tunnel_is_open(dims):
-    """No corner to hide in: backing out of the world is leaving the tunnel."""
+    """Stepping out of the world leaves the tunnel, so there is no safe corner."""
     env = TunnelEnv(**dims)
     back = -np.eye(2)[0] if dims["coupled_dims"] == 1 else -np.ones(2)
     for _ in range(7):
@@ -237,7 +237,8 @@ def test_start_noise_runs_along_the_path(path):
     assert 0.28 < distances.max() <= 0.3
     low, high = np.array(starts).min(axis=0), np.array(starts).max(axis=0)
     widest = (high - low).max()
-    # The line's noise spreads over both coordinates; the spline begins where it begins.
+    # On the line the noise spreads over both coordinates; the spline has no points before its
+    # start.
     expected = {"line": 0.6 / math.sqrt(2), "circle": 2 * 0.7 * math.sin(0.3 / 0.7), "spline": 0.3}
     assert 0.93 * expected[path] < widest <= expected[path] + 1e-12
 

@@ -21,14 +21,14 @@ L_SHAPE = spline_path([(0.0, 0.0), (0.5, 0.0), (0.5, 0.5)])
 
 
 @pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
-def test_centre_line_has_no_offset_and_leads_to_the_goal(path: Path):
+def test_center_line_has_no_offset_and_leads_to_the_goal(path: Path):
     goal = path.goal_arcs[0]
     arcs = np.linspace(0.0, goal, 50)
     offsets, remaining = zip(*(path.locate(path.point(arc)) for arc in arcs), strict=True)
     assert np.allclose(offsets, 0.0, atol=1e-12)
     assert remaining[0] > 0.0
     assert remaining[-1] == pytest.approx(0.0, abs=1e-12)
-    if path is not PATHS["circle"]:  # where the way back is the shorter one at first
+    if path is not PATHS["circle"]:  # where the way back is shorter at first
         assert np.allclose(remaining, goal - arcs)
 
 

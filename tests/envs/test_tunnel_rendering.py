@@ -12,7 +12,7 @@ from flowpolicy_envs.registration import TUNNEL_IDS
 VIEW = 1.04
 
 
-def count(frame: np.ndarray, colour: str) -> int:
+def count(frame: np.ndarray, color: str) -> int:
     red, green, blue = frame.astype(int).transpose(2, 0, 1)
     masks = {
         "red": (red > 150) & (green < 130) & (blue < 130),
@@ -21,7 +21,7 @@ def count(frame: np.ndarray, colour: str) -> int:
         "black": frame.max(axis=2) < 30,
         "white": frame.min(axis=2) > 250,
     }
-    return int(masks[colour].sum())
+    return int(masks[color].sum())
 
 
 def pixel(frame: np.ndarray, x: float, y: float) -> np.ndarray:
@@ -37,8 +37,8 @@ def test_frames_show_walls_goal_agent_and_samples(env_id):
     assert plain.shape == (600, 600, 3)
     assert plain.dtype == np.uint8
     assert count(plain, "white") > 0.8 * 600 * 600
-    for colour in ("red", "green", "black"):
-        assert count(plain, colour) > 30, colour
+    for color in ("red", "green", "black"):
+        assert count(plain, color) > 30, color
     assert count(plain, "blue") == 0
     env.unwrapped.set_action_samples(np.random.default_rng(0).uniform(-1, 1, (50, 2)))
     assert count(env.render(), "blue") > 300
@@ -54,7 +54,7 @@ def test_agent_trail_goal_and_samples_are_where_they_should_be():
     frame = env.render()
     assert frame is not None
     assert pixel(frame, 0.3, 0.3).max() < 30
-    assert len(set(pixel(frame, 0.0, 0.0))) == 1  # grey: where the agent has been
+    assert len(set(pixel(frame, 0.0, 0.0))) == 1  # gray: a past position
     assert pixel(frame, 0.0, 0.0).max() < 200
     goal, sample = pixel(frame, 0.95, 0.95).astype(int), pixel(frame, 0.6, 0.0).astype(int)
     assert goal[1] > goal[0] + 40

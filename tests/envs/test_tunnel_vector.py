@@ -63,7 +63,7 @@ def test_each_agent_equals_a_single_environment_with_its_seed(path):
             assert reward == rewards[i]
 
 
-def test_resets_go_on_with_the_generators():
+def test_resets_continue_with_the_generators():
     envs = TunnelVectorEnv(3, start_noise=0.5)
     first, _ = envs.reset(seed=4)
     second, _ = envs.reset()

@@ -1,4 +1,4 @@
-"""The vectorised environments are gymnasium's own vectorisation, only faster."""
+"""The vectorized environments equal gymnasium's own vectorization."""
 
 from typing import Any
 
@@ -11,8 +11,8 @@ from flowpolicy_envs.registration import SQUARE_IDS, TUNNEL_IDS
 
 COUNT, STEPS = 5, 120
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
-# With these, episodes end in all the ways they can: the Tunnel's by leaving, goal and time limit,
-# the Square's by dropping and time limit (fingers break too rarely to count on it).
+# With these, episodes end in all possible ways: the Tunnel's by leaving, goal and time limit, the
+# Square's by dropping and time limit (fingers break too rarely).
 TUNNEL = {"start_noise": 0.4, "width": 0.2, "max_episode_steps": 7, "dense_reward": 1.0}
 SQUARE = {
     "weight": [1.0, 3.0],
@@ -42,7 +42,7 @@ def make_pair(env_id: str, mode: AutoresetMode, **kwargs: Any) -> tuple[VectorEn
 
 
 def assert_same(ours: Any, theirs: Any) -> None:
-    """Equal values, types and keys, down to the last bit."""
+    """Check that values, types and keys are equal, bit for bit."""
     assert type(ours) is type(theirs)
     if isinstance(ours, dict):
         assert ours.keys() == theirs.keys()
@@ -61,7 +61,7 @@ def assert_same(ours: Any, theirs: Any) -> None:
 
 @pytest.fixture
 def gymnasiums_own_time_limit(monkeypatch):
-    """rl_zoo3 puts a time limit of its own into gymnasium, once any test has imported it."""
+    """Undo rl_zoo3's patch of gymnasium's time limit, for when another test imported rl_zoo3."""
     classes = gym.wrappers.TimeLimit.__mro__
     own = next(c for c in classes if c.__module__.startswith("gymnasium."))
     monkeypatch.setattr(gym.wrappers, "TimeLimit", own)
@@ -70,7 +70,7 @@ def gymnasiums_own_time_limit(monkeypatch):
 @pytest.mark.usefixtures("gymnasiums_own_time_limit")
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env_id", ARGUMENTS)
-def test_equals_gymnasiums_vectorisation_bit_for_bit(env_id, mode):
+def test_equals_gymnasiums_vectorization_bit_for_bit(env_id, mode):
     ours, theirs = make_pair(env_id, mode, **ARGUMENTS[env_id])
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -88,7 +88,7 @@ def test_equals_gymnasiums_vectorisation_bit_for_bit(env_id, mode):
     assert ends.min() > 0
 
 
-def test_disabled_mode_waits_for_the_caller():
+def test_disabled_mode_leaves_resets_to_the_caller():
     ours, theirs = make_pair("TunnelDiagonal-v0", AutoresetMode.DISABLED, start_noise=0.1)
     ours.reset(seed=0), theirs.reset(seed=0)
     actions = np.zeros((COUNT, 2), np.float32)

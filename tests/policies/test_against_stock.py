@@ -69,7 +69,7 @@ def test_same_first_update(ent_coef: str | float, weight_decay: float) -> None:
 
 
 def test_stock_epsilon_changes_an_update_by_less_than_its_own_size() -> None:
-    """Untouched stock SAC, epsilon and all: the same losses to five digits."""
+    """Unmodified stock SAC, with its epsilon, has the same losses up to 1e-4."""
     stock = with_data(SAC("MlpPolicy", "Pendulum-v1", **SETTINGS), 1)
     ours = with_data(SAC(GaussPolicy, "Pendulum-v1", **SETTINGS), 1)
     for key in ("train/actor_loss", "train/critic_loss"):
@@ -89,8 +89,9 @@ def test_checkpoints_are_exchanged(tmp_path: Path, direction: str) -> None:
     np.testing.assert_array_equal(
         target.predict(obs, deterministic=True)[0], source.predict(obs, deterministic=True)[0]
     )
-    # Optimiser state came along: both go on in the same way. Adam turns rounding of a gradient
-    # near zero into a fraction of a step (3e-4); without its state the steps would differ whole.
+    # The optimizer state was exchanged, too, so the next update is the same. Adam turns the
+    # rounding of a gradient near zero into a fraction of a step (3e-4); without its state the steps
+    # would differ completely.
     exact_jacobian(stock)
     with_data(source, 1)
     with_data(target, 1)

@@ -1,4 +1,4 @@
-"""Deterministic actions: the base mean, or the best of candidates that are always the same."""
+"""Deterministic actions: the base mean, or the best of a fixed set of candidates."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ BOX = gym.spaces.Box(-1, 1, (4,), np.float32)
 
 
 class Spaces(gym.Env):
-    """Four observations, three actions with bounds of their own; never stepped."""
+    """Four observations and three actions with different bounds; never stepped."""
 
     observation_space = BOX
     action_space = gym.spaces.Box(np.float32(-2), np.float32([1, 2, 3]))
 
 
 def make(algorithm: type[SAC] = SACFlow, **policy_kwargs: Any) -> SAC:
-    """An agent whose weights are random: an identity flow's base mean is hard to beat."""
+    """An agent with random weights, because the base mean of an identity flow is hard to beat."""
     kwargs = {"net_arch": [16, 16], **policy_kwargs}
     model = algorithm(FlowPolicy, Spaces(), policy_kwargs=kwargs, **FAST)
     th.manual_seed(3)
@@ -68,7 +68,7 @@ def test_best_of_the_candidates_is_taken(distribution: str, mode: str) -> None:
     base = score(model, obs, scaled(model, obs, "base"), mode)
     assert (chosen >= base - 1e-3).all()
     assert (chosen > base + 1e-2).any()
-    # None of the others is better. By definition; computed one by one.
+    # No other candidate is better when evaluated on its own.
     noise = deterministic.candidate_noise(64, model.actor.density.noise_dim)
     with th.no_grad():
         context = model.actor.context(th.as_tensor(obs))
@@ -98,7 +98,7 @@ def test_deterministic_means_deterministic(algorithm: type[SAC], mode: str, tmp_
     first = model.predict(obs, deterministic=True)[0]
     drawn = th.rand(3)
     th.manual_seed(1)
-    assert th.equal(th.rand(3), drawn)  # acting took no random numbers
+    assert th.equal(th.rand(3), drawn)  # predict drew no random numbers
     np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], first)
     one_by_one = [model.predict(row, deterministic=True)[0] for row in obs]
     np.testing.assert_allclose(one_by_one, first, atol=1e-4)
@@ -112,7 +112,7 @@ def test_deterministic_means_deterministic(algorithm: type[SAC], mode: str, tmp_
 
 
 @pytest.mark.parametrize("at_first", ["base", "log_prob"])
-def test_a_mode_that_is_set_later_is_saved_as_well(at_first: str, tmp_path: Path) -> None:
+def test_a_mode_that_is_set_later_is_saved(at_first: str, tmp_path: Path) -> None:
     model = make(deterministic_mode=at_first)
     assert isinstance(model.policy, FlowPolicy)
     for mode in ("q", "base"):
@@ -123,7 +123,7 @@ def test_a_mode_that_is_set_later_is_saved_as_well(at_first: str, tmp_path: Path
         assert loaded.policy.deterministic_samples == 64
 
 
-def test_many_observations_are_chosen_for_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_observations_are_processed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     model, obs = make(), observations()
     whole = act(model, obs, "q")
     monkeypatch.setattr(deterministic, "_MOST_AT_ONCE", 7 * 64)
@@ -185,7 +185,7 @@ def test_gsde_has_no_candidates() -> None:
         )
 
 
-def test_a_bad_mode_is_refused_later_too_and_changes_nothing() -> None:
+def test_setting_a_bad_mode_later_is_refused() -> None:
     model = make(deterministic_mode="q")
     assert isinstance(model.policy, FlowPolicy)
     with pytest.raises(ValueError, match=r"deterministic_mode must be one of .* got 'best'"):

@@ -1,4 +1,4 @@
-"""Everything SB3 documents for SAC policies, with ours."""
+"""The features that SB3 documents for SAC policies, with ours."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NET = {"net_arch": [16, 16]}
 
 
 class MatrixActions(gym.Env):
-    """Actions of shape (2, 3) with bounds that are not symmetric."""
+    """Actions of shape (2, 3) with asymmetric bounds."""
 
     observation_space = spaces.Box(-1, 1, (4,), np.float32)
     action_space = spaces.Box(np.float32(0), np.arange(1, 7, dtype=np.float32).reshape(2, 3))
@@ -139,7 +139,7 @@ def test_hindsight_experience_replay(policy: str) -> None:
 
 
 @pytest.mark.parametrize("policy", MLP)
-def test_several_normalised_environments(policy: str) -> None:
+def test_several_normalized_environments(policy: str) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=3, seed=0))
     model = SACFlow(policy, env, policy_kwargs=NET, **FAST).learn(60)
     assert parameters_finite(model)
@@ -182,7 +182,7 @@ def test_policy_aliases_name_their_class() -> None:
         assert getattr(policies, policy_class.__name__) is policy_class
 
 
-# Arguments other than the defaults, for the densities that have any.
+# Other than default arguments, for the densities that have arguments.
 UNUSUAL: dict[str, dict] = {
     "realnvp": {"layers": 3, "hidden": [6, 5], "init": "default"},
     "low_rank": {"rank": 1},
@@ -210,11 +210,11 @@ for path in sorted(folder.glob("*.zip")):
 
 
 def test_saved_models_predict_the_same_in_a_new_process(tmp_path: Path) -> None:
-    """Every policy class, every density, other than default arguments; the policy alone too."""
+    """All policy classes and densities, with unusual arguments; also saved as a policy alone."""
     models: dict[str, SACFlow] = {}
     for name, distribution_class in registered_distributions().items():
         if not distribution_class.__module__.startswith("sb3_flowpolicy.distributions"):
-            continue  # registered by a test or a doctest: the new process does not know it
+            continue  # registered by a test or a doctest: unknown in a new process
         policy_kwargs = {**NET, "distribution": name, "share_features_extractor": True}
         policy_kwargs["distribution_kwargs"] = UNUSUAL.get(name, {})
         model = SACFlow("FlowPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, **FAST)

@@ -1,10 +1,11 @@
-"""The state of N Squares, and the two things that happen to it: resets and steps."""
+"""The state of N Squares, with reset and step."""
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowpolicy_envs.env import Generators
 from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.config import SquareConfig
 from flowpolicy_envs.square.tasks import as_task
@@ -12,15 +13,13 @@ from flowpolicy_envs.square.tasks import as_task
 METRICS = ("held_fraction", "x_std", "x_max", "distance_std", "distance_max")
 END_REASONS = np.array(["timeout", "dropped", "broken"], dtype=object)
 
-Generators = Callable[[int], np.random.Generator]
-
 
 class SquareBatch:
-    """N worlds with the same rules, each with constants and poses of its own.
+    """N worlds with the same rules, each with its own constants and poses.
 
-    Both environments are thin layers over this class, the single one with N = 1, which is why
-    they agree to the last bit. The arrays below are allocated once and overwritten by each call:
-    whoever hands them on has to copy them.
+    The single and the vectorized environment use this class, the single one with N = 1, so they
+    agree bit for bit. The arrays below are allocated once and overwritten by each call: copy what
+    you keep.
 
     Args:
         config: The rules.
@@ -32,9 +31,9 @@ class SquareBatch:
         terminated: Whether the latest step ended the episode, (N,).
         bodies: Position, angle and velocities x, y, theta, vx, vy, omega of the squares, (N, 6).
         fingers: Positions of the fingers, (N, 4, 2).
-        targets: Where the controllers pull them, (N, 4, 2).
-        presses: Mean normal force of each finger during the latest step, N, (N, 4).
-        held: Whether these sufficed to hold the square, (N,).
+        targets: Targets of the fingers' controllers, (N, 4, 2).
+        presses: Mean normal force of each finger during the latest step, in newtons, (N, 4).
+        held: Whether these forces hold the square, (N,).
         success: Whether the goal has been reached or, without a goal, the square is held after
             the warm-up, (N,).
         metrics: The columns named in `METRICS`, (N, 5).
@@ -73,7 +72,7 @@ class SquareBatch:
         self._setup_ends = config.setup_ends
         self._noise = np.zeros((count, config.frame_width))
         self._requests = np.zeros((count, kernels.ACTIONS))
-        # Collected once: building these tuples anew would cost as much as the step itself.
+        # Built once: building these tuples takes as long as a step.
         self._seen = (
             config.picked,
             self._noise,
@@ -107,11 +106,11 @@ class SquareBatch:
         self.is_noisy = bool(config.noise.any())
 
     def reset(self, chosen: NDArray[np.bool_], generators: Generators) -> None:
-        """Begin new episodes.
+        """Start new episodes.
 
         Args:
             chosen: In which worlds, boolean of shape (N,).
-            generators: Function from the number of a world to its random generator.
+            generators: Function from the index of a world to its random generator.
         """
         for n in np.flatnonzero(chosen).tolist():
             generators(n).random(out=self._uniform[n])
@@ -147,8 +146,17 @@ class SquareBatch:
         if culprit >= 0:
             raise ValueError(f"actions must not contain NaN, got {given[culprit]} at {culprit}")
 
+    def info(self, n: int) -> dict[str, Any]:
+        """Return the `info` of world n, see `SquareEnv`."""
+        return {
+            "is_success": self.success.item(n),
+            "held": self.held.item(n),
+            **dict(zip(METRICS, self.metrics[n].tolist(), strict=True)),
+            "end_reason": END_REASONS[self.ends.item(n)],
+        }
+
     def infos(self) -> dict[str, NDArray]:
-        """Return what is known about the running episodes: arrays (N,), see `SquareEnv`."""
+        """Return new arrays (N,) with the `info` of all worlds."""
         columns = dict(zip(METRICS, self.metrics.T.copy(), strict=True))
         return {
             "is_success": self.success.copy(),

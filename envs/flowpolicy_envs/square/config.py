@@ -1,4 +1,4 @@
-"""The arguments of a Square, checked once for the single and the vectorised environment."""
+"""The arguments of a Square."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -13,7 +13,7 @@ from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.tasks import FindGoal, Task, as_task
 
 Range = float | Sequence[float]
-"""A number, or two: the ends of the interval from which each episode draws its own."""
+"""A number, or the two ends of an interval from which each episode draws."""
 
 FEATURES: dict[str, slice] = {
     "position": slice(0, 2),
@@ -22,12 +22,12 @@ FEATURES: dict[str, slice] = {
     "action": slice(12, 20),
     "timer": slice(20, 21),
 }
-"""What can be observed, and where in the complete observation it is."""
+"""The parts of the complete observation."""
 
 DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-"""From the middle of the world to the fingers: right, top, left, bottom."""
+"""Directions from the middle of the world to the fingers: right, top, left, bottom."""
 
-# Argument, column of the constants. All must be positive but those in _MAY_BE_ZERO.
+# Argument -> column of the constants. All must be positive except those in _MAY_BE_ZERO.
 _CONSTANTS = {
     "size": kernels.HALF_SIDE,
     "mass": kernels.MASS,
@@ -94,7 +94,7 @@ class SquareConfig:
 
     def __post_init__(self) -> None:
         """Check the arguments and derive what follows from them."""
-        # The one way round a dataclass's own freeze.
+        # The dataclass is frozen.
         object.__setattr__(self, "task", as_task(self.task))
         names = (*_CONSTANTS, "kd", *_POSE)
         ranges = {name: _checked_range(name, getattr(self, name)) for name in names}
@@ -119,7 +119,7 @@ class SquareConfig:
             if not is_whole(value) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
         self._check_stability()
-        # Rounded first: 2 s / 0.25 s must not become nine steps.
+        # Rounded first, so that 2 s / 0.25 s does not become nine steps.
         steps = math.ceil(round(self.warm_up / (self.dt * self.substeps), 9))
         object.__setattr__(self, "warm_steps", steps)
         object.__setattr__(self, "picked", _picked(self.observe))
@@ -135,7 +135,7 @@ class SquareConfig:
                 f"dt * kp / (kd + finger_damping) must be at most 1 for the controller to settle, "
                 f"got {settling:.3g}"
             )
-        # Of a corner, when pushed along a face's normal.
+        # The mobility of a corner that is pushed along the normal of a face.
         mobility = 1.0 / low["mass"] + (high["size"] / 2.0) ** 2 / low["inertia"]
         drag = high["kd"] + high["finger_damping"]
         coupling = kernels.FINGERS * self.dt * drag * mobility
@@ -168,7 +168,7 @@ class SquareConfig:
 
     @property
     def setup_ends(self) -> NDArray[np.float64]:
-        """The least and the greatest setup of an episode, (2, 25), named in `square.kernels`."""
+        """The smallest and the largest setup of an episode, (2, 25), see `square.kernels`."""
         ends = np.zeros((2, kernels.N_SETUP))
         for name, column in _CONSTANTS.items():
             ends[:, column] = self._ranges[name]
@@ -195,7 +195,7 @@ def _checked_range(name: str, value: Range) -> tuple[float, float]:
 
 
 def _picked(observe: Sequence[str]) -> NDArray[np.int64]:
-    """Return which of the 21 features are observed."""
+    """Return the indices of the observed features."""
     names = list(observe) if isinstance(observe, Collection) else []
     known = all(isinstance(name, str) and name in FEATURES for name in names)
     if isinstance(observe, str) or not names or not known:
@@ -205,7 +205,7 @@ def _picked(observe: Sequence[str]) -> NDArray[np.int64]:
 
 
 def _noise(noise: float | Mapping[str, float]) -> NDArray[np.float64]:
-    """Return the standard deviation of each of the 21 features' noise."""
+    """Return the standard deviation of the noise of each feature, (21,)."""
     by_name = noise if isinstance(noise, Mapping) else dict.fromkeys(FEATURES, noise)
     scales = np.zeros(kernels.N_FEATURES)
     for name, scale in by_name.items():

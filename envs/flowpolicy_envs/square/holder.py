@@ -1,4 +1,4 @@
-"""A scripted holder: the simplest controller that never drops the square."""
+"""A scripted controller that never drops the square."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,15 +8,15 @@ from flowpolicy_envs.square.kernels import ACTIONS
 
 
 class Holder:
-    """Presses all four fingers inwards, by the same amount, whatever it observes.
+    """Presses all four fingers inwards by the same amount, regardless of the observation.
 
-    Called with an observation it returns an action, as `record_demonstrations` of
-    `sb3_flowpolicy.algorithms.demonstrations` wants it; the observation may be a batch.
+    Maps an observation, or a batch of them, to an action: a controller for
+    `sb3_flowpolicy.algorithms.demonstrations.record_demonstrations`.
 
     Args:
-        push: How far inwards the targets are, as a share of the reach, in [0, 1].
-        noise: Standard deviation of normal noise on each component of the action. Demonstrations
-            that always do the same teach little about what other actions lead to.
+        push: Distance of the targets inwards, as a share of the reach, in [0, 1].
+        noise: Standard deviation of normal noise on each component of the action. Without noise,
+            demonstrations say little about the effect of other actions.
         seed: Seed of the noise.
 
     Raises:

@@ -1,11 +1,10 @@
 """Compiled mechanics, rewards and observations of the Square, for a batch of worlds at once.
 
-Contact is rigid. A finger has no mass and, in its viscous surroundings, pushes with the force F of
-its controller less what it needs to move itself: a finger whose tip moves with velocity v exerts
-F - c v. So the forces on the square follow from its own velocity, and no spring or impact law is
-needed: what contact does to the square's motion is push, or damp.
+Contact is rigid. A finger has no mass and moves against viscous drag: a finger whose controller
+exerts the force F and whose tip moves with velocity v pushes with F - c v. So the forces on the
+square follow from its own velocity, without springs or impacts: contact pushes or damps its motion.
 
-All of it lives in one file on purpose: numba's cache notices changes only in the file of the
+All compiled code is in one file because numba's cache only notices changes in the file of the
 function that is called.
 """
 
@@ -19,26 +18,26 @@ FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 FINGERS = 4
 ACTIONS = 2 * FINGERS
 
-# Columns of `constants` (N, 12), which are drawn anew for each episode.
+# Columns of `constants` (N, 12), which each episode draws.
 HALF_SIDE, MASS, INERTIA, LINEAR_DAMPING, ANGULAR_DAMPING, FRICTION = range(6)
 WEIGHT, STIFFNESS, DRAG, MAX_FORCE, MAX_SPEED, REACH = range(6, 12)
 N_CONSTANTS = 12
 
-# What an episode begins with (25,): the constants, with the fingers' own damping for the drag,
-# then these.
+# The setup of an episode (25,): the constants, with the fingers' own damping in place of the drag,
+# followed by these.
 KD, POSE, PLACES, GOAL_AT = 12, slice(13, 16), slice(16, 24), 24
 N_SETUP = 25
 
-# Entries of `reward_terms` (11,), the task; see flowpolicy_envs.square.tasks.
+# Entries of `reward_terms` (11,), see flowpolicy_envs.square.tasks.
 HELD, FAILURE, OVERREACH, SAFE_REACH, EFFORT, ANGLE = range(6)
 POSITION_BEFORE, POSITION_AFTER, Y_AFTER, GOAL, GOAL_RADIUS = range(6, 11)
 N_REWARD_TERMS = 11
 
-# Columns of `tallies` (N, 10): what the metrics of an episode are computed from.
+# Columns of `tallies` (N, 10), from which the metrics of an episode are computed.
 N_STEPS, N_HELD, N_AFTER, SUM_X, SUM_X2, MAX_X, SUM_R, SUM_R2, MAX_R, RETURN = range(10)
 N_TALLIES = 10
 
-# Columns of `metrics` (N, 5): what is told about an episode; names in flowpolicy_envs.square.batch.
+# Columns of `metrics` (N, 5), named in flowpolicy_envs.square.batch.
 N_METRICS = 5
 
 # Values of `ends` (N,).
@@ -47,11 +46,11 @@ GOING_ON, DROPPED, BROKEN = range(3)
 N_FEATURES = 4 + ACTIONS + ACTIONS + 1
 """Position, cosine and sine of the angle, fingers, last action, timer."""
 
-# What a substep notes about each finger: force of its controller along normal and tangent, the
-# normal, both levers, share of the substep in contact, room to move, and bounds of the forces.
+# Scratch columns of each finger in a substep: force of its controller along normal and tangent, the
+# normal, both levers, share of the substep in contact, room to move, bounds of the forces.
 _PUSH, _PULL, _NORMAL_X, _NORMAL_Y, _LEVER, _TANGENT_LEVER, _SHARE, _ROOM = range(8)
 _LIMIT, _LEAST_RUB, _MOST_RUB = range(8, 11)
-# And, in the last row, what follows from the constants.
+# The last row holds values derived from the constants.
 _PER_DT, _PER_MASS, _PER_INERTIA, _PER_DRAG, _LINEAR, _ANGULAR = range(6)
 SCRATCH = (FINGERS + 1, 11)
 
@@ -59,15 +58,15 @@ _STANDSTILL = 1e-30
 """Units or radians per second."""
 
 SWEEPS = 3
-"""How often contact forces are matched to the velocity they lead to. Each sweep makes the mismatch
-smaller by the factor that `SquareConfig` keeps below 1/2."""
+"""Iterations that match the contact forces to the velocity they cause. Each sweep reduces the
+mismatch by a factor that `SquareConfig` keeps below 1/2."""
 
 BREAKING = 1.02
-"""A finger breaks when it is pushed this far out, in units of its reach: a little more than 1, so
+"""A finger breaks at this distance from its start, in units of its reach. A little more than 1, so
 that pressing against the edge of the reach is safe."""
 
 
-# Python's error model would check each division for zero; `SquareConfig` has excluded that.
+# Python's error model would check each division for zero, which `SquareConfig` excludes.
 _compiled = njit(cache=True, error_model="numpy")
 
 
@@ -78,7 +77,7 @@ def _clip(value: float, low: float, high: float) -> float:
 
 @_compiled
 def _derive(dt: float, constants: FloatArray, derived: FloatArray) -> None:
-    """Write what a substep needs of the constants into `derived`: divisions are slow."""
+    """Write the quotients that a substep needs into `derived`, because divisions are slow."""
     derived[_PER_DT] = 1.0 / dt
     derived[_PER_MASS] = 1.0 / constants[MASS]
     derived[_PER_INERTIA] = 1.0 / constants[INERTIA]
@@ -114,7 +113,7 @@ def _substep(
         force_y = _clip(stiffness * (targets[i, 1] - fingers[i, 1]), -max_force, max_force)
         arm_x, arm_y = fingers[i, 0] - x, fingers[i, 1] - y
         local_x, local_y = cos * arm_x + sin * arm_y, cos * arm_y - sin * arm_x
-        # The nearest face, its inward normal, and the way to it (negative inside the square).
+        # The nearest face, its inward normal, and the distance to it (negative inside the square).
         if abs(local_x) > abs(local_y):
             sign = math.copysign(1.0, -local_x)
             normal_x, normal_y = sign * cos, sign * sin
@@ -124,23 +123,23 @@ def _substep(
             normal_x, normal_y = -sign * sin, sign * cos
             gap, beside = abs(local_y) - half, abs(local_x) > half
         lever = arm_x * normal_y - arm_y * normal_x
-        # The tangent is the normal, turned left.
+        # The tangent is the normal turned left.
         tangent_lever = arm_x * normal_x + arm_y * normal_y
         push = normal_x * force_x + normal_y * force_y
         closing = max(gap, 0.0) * per_dt
         share, limit, room = 0.0, 0.0, math.inf
         if not beside:
-            # A finger that slipped in at a corner is put back on the face if its controller agrees.
-            # Against the controller that would cost energy which nobody has paid.
+            # A finger that slipped in at a corner is put back on the face if its controller pulls
+            # it that way. Against the controller this would add energy.
             room = gap * per_dt if gap > 0.0 or push <= 0.0 else 0.0
             recede = normal_x * old_vx + normal_y * old_vy + lever * old_omega
             approach = _clip(push * per_drag, -top_speed, top_speed) - recede
             if approach > closing:
                 touching = True
-                # One that is still on its way presses for the rest of the substep only.
+                # A finger that is still approaching presses for the rest of the substep only.
                 share = 1.0 - closing / approach
-                # A finger is not faster than its top speed, so neither is what it pushes or drags:
-                # within the substep its force may bring the point of contact up to it, not beyond.
+                # A finger cannot exceed its top speed, and neither can what it pushes or drags:
+                # its force may accelerate the point of contact to that speed, not beyond.
                 inert = per_dt / (per_mass + lever * lever * per_inertia)
                 limit = max(top_speed - recede - closing, 0.0) * inert
                 along = normal_x * old_vy - normal_y * old_vx + tangent_lever * old_omega
@@ -153,8 +152,8 @@ def _substep(
         scratch[i, _SHARE], scratch[i, _LIMIT], scratch[i, _ROOM] = share, limit, room
         forces[i, 0], forces[i, 1], forces[i, 2], forces[i, 3] = 0.0, 0.0, 0.0, 0.0
 
-    # Implicit: forces and the velocity they lead to are matched by iteration. All fingers are
-    # treated alike in each sweep, which keeps mirror images mirror images.
+    # Implicit step: iteration matches the forces to the velocity they cause. Each sweep treats all
+    # fingers alike, which preserves mirror symmetry.
     vx, vy, omega = old_vx, old_vy, old_omega
     for _ in range(SWEEPS if touching else 1):
         sum_x, sum_y, torque = 0.0, 0.0, 0.0
@@ -195,17 +194,17 @@ def _substep(
                 pull = normal_x * vy - normal_y * vx + scratch[i, _TANGENT_LEVER] * omega
             else:
                 pull = _clip((scratch[i, _PULL] - rub) * per_drag, -top_speed, top_speed)
-        # No finger may enter the square; one that is inside is put back on the face.
+        # No finger may enter the square. A finger inside is put back on the face.
         recede = normal_x * vx + normal_y * vy + scratch[i, _LEVER] * omega
         push = min(push, recede + scratch[i, _ROOM])
         fingers[i, 0] += dt * (push * normal_x - pull * normal_y)
         fingers[i, 1] += dt * (push * normal_y + pull * normal_x)
 
-    # A square that nobody touches would creep on with ever smaller, ever slower to compute numbers.
+    # Without contact the velocity decays towards subnormal numbers, which are slow to compute with.
     body[3] = vx if abs(vx) > _STANDSTILL else 0.0
     body[4] = vy if abs(vy) > _STANDSTILL else 0.0
     body[5] = omega if abs(omega) > _STANDSTILL else 0.0
-    # The world has walls for the middle of the square; no task comes near them.
+    # Walls keep the center of the square in the world; no task comes near them.
     body[0] = _clip(x + dt * body[3], -1.0, 1.0)
     body[1] = _clip(y + dt * body[4], -1.0, 1.0)
     body[2] += dt * body[5]
@@ -237,13 +236,13 @@ def simulate(
 
     Args:
         dt: Seconds per substep.
-        substeps: Their number.
+        substeps: Number of substeps.
         constants: Physical constants, (12,).
-        starts: Where the fingers started, (4, 2).
-        targets: Where the controllers pull the fingers, (4, 2).
+        starts: Starts of the fingers, (4, 2).
+        targets: Targets of the fingers' controllers, (4, 2).
         body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
         fingers: Positions, (4, 2).
-        scratch: Room to work in, (5, 11).
+        scratch: Working memory, (5, 11).
         forces: Overwritten by the contact forces on the square in the last substep, (4, 4): normal
             (inwards) and tangential force in N, then the same force along x and y.
         presses: Overwritten by each finger's mean normal force in N, (4,).
@@ -383,9 +382,9 @@ def reset_batch(
     ends: np.ndarray,
     observations: np.ndarray,
 ) -> None:
-    """Begin episodes in the `chosen` (N,) worlds.
+    """Start episodes in the `chosen` (N,) worlds.
 
-    Their setups lie between `least` and `most` (25,), where `uniform` (N, 25) in [0, 1) says.
+    `uniform` (N, 25) in [0, 1) interpolates their setups between `least` and `most` (25,).
     """
     width = picked.shape[0]
     for n in range(chosen.shape[0]):
@@ -456,9 +455,9 @@ def step_batch(
     ends: np.ndarray,
     observations: np.ndarray,
 ) -> int:
-    """Request targets `requests` (N, 8) in the `active` (N,) worlds and see what comes of it.
+    """Request targets `requests` (N, 8) in the `active` (N,) worlds, simulate and reward.
 
-    Inactive worlds stand still, earn nothing and do not terminate.
+    Inactive worlds stand still, get no reward and do not terminate.
 
     Returns:
         -1, or the index of the first active world whose request contains NaN. In that case
@@ -497,7 +496,7 @@ def step_batch(
         for i in range(FINGERS):
             press += presses[n, i]
         held[n] = constants[n, FRICTION] * press >= constants[n, WEIGHT]
-        # The timer that the agent saw before this step decides: it drops nothing before that is 0.
+        # The warm-up ends when the timer that the agent saw before this step is 0.
         warm = tallies[n, N_STEPS] < warm_steps
         _tally(held[n], warm, bodies[n], tallies[n])
         if broken:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     import pygame
 
 RENDER_FPS = 4
-"""The agent's frequency: pictures show real time."""
+"""The frequency of the agent, so that pictures show real time."""
 
-COLOURS = ((214, 39, 40), (31, 119, 180), (44, 150, 44), (230, 130, 14))
-"""Of the fingers: right, top, left, bottom."""
+COLORS = ((214, 39, 40), (31, 119, 180), (44, 150, 44), (230, 130, 14))
+"""Colors of the fingers: right, top, left, bottom."""
 
 _BORDER = (60, 60, 60)
 _SQUARE = (25, 25, 25)
@@ -34,10 +34,10 @@ _REGION = (222, 240, 222)
 class Renderer(Canvas):
     """Draws one Square of a batch.
 
-    Black is the square, with a white mark that shows how it is turned. Fingers are discs; boxes in
-    their colours are their reach, rings their targets, small dots where sampled actions would put
-    these. The lamp on the top right is green while the square is held; the bar below it is the
-    holding force, with a stroke at what the weight demands. Green on the diagonal: the hidden goal
+    The square is black, with a white mark that shows its orientation. Fingers are discs; boxes in
+    their colors show their reach, rings their targets, small dots the targets of sampled actions.
+    The lamp at the top right is green while the square is held; the bar below it shows the holding
+    force, with a line at the force that the weight requires. Green on the diagonal: the hidden goal
     and the region from which it was drawn.
 
     Args:
@@ -108,16 +108,16 @@ class Renderer(Canvas):
         task = self._config.task
         if isinstance(task, FindGoal):
             goal = self._screen(batch.goals[[i]])[0]
-            colour = _HELD if batch.found[i] else _GOAL
-            pygame.draw.circle(canvas, colour, goal, task.radius * self._scale, self._pixels(0.01))
+            color = _HELD if batch.found[i] else _GOAL
+            pygame.draw.circle(canvas, color, goal, task.radius * self._scale, self._pixels(0.01))
 
     def _draw_samples(
         self, canvas: "pygame.Surface", batch: SquareBatch, i: int, samples: NDArray[np.float64]
     ) -> None:
         reach = batch.constants[i, kernels.REACH]
         targets = batch.starts[i] + reach * np.clip(samples, -1.0, 1.0).reshape(-1, 4, 2)
-        for finger, colour in enumerate(COLOURS):
-            self._dots(canvas, (*colour, 150), 0.007, targets[:, finger])
+        for finger, color in enumerate(COLORS):
+            self._dots(canvas, (*color, 150), 0.007, targets[:, finger])
 
     def _draw_fingers(self, canvas: "pygame.Surface", batch: SquareBatch, i: int) -> None:
         import pygame
@@ -127,31 +127,31 @@ class Renderer(Canvas):
             self._screen(points[i]) for points in (batch.starts, batch.targets, batch.fingers)
         )
         line = self._pixels(0.006)
-        for k, colour in enumerate(COLOURS):
+        for k, color in enumerate(COLORS):
             corner = (starts[k] - reach).round()
             box = pygame.Rect(corner[0], corner[1], round(2 * reach), round(2 * reach))
-            pygame.draw.rect(canvas, colour, box, width=line)
-        for k, colour in enumerate(COLOURS):
+            pygame.draw.rect(canvas, color, box, width=line)
+        for k, color in enumerate(COLORS):
             pygame.draw.circle(canvas, (255, 255, 255), targets[k], self._pixels(0.022))
-            pygame.draw.circle(canvas, colour, targets[k], self._pixels(0.018), 2 * line)
+            pygame.draw.circle(canvas, color, targets[k], self._pixels(0.018), 2 * line)
             pygame.draw.circle(canvas, (255, 255, 255), fingers[k], self._pixels(0.04))
-            pygame.draw.circle(canvas, colour, fingers[k], self._pixels(0.034))
+            pygame.draw.circle(canvas, color, fingers[k], self._pixels(0.034))
 
     def _draw_lamp(self, canvas: "pygame.Surface", batch: SquareBatch, i: int) -> None:
         import pygame
 
-        centre = self._screen(np.array([[0.9, 0.9]]))[0]
-        colour = _HELD if batch.held[i] else _LOOSE
-        pygame.draw.circle(canvas, colour, centre, self._pixels(0.055))
-        pygame.draw.circle(canvas, _BORDER, centre, self._pixels(0.055), self._pixels(0.006))
+        center = self._screen(np.array([[0.9, 0.9]]))[0]
+        color = _HELD if batch.held[i] else _LOOSE
+        pygame.draw.circle(canvas, color, center, self._pixels(0.055))
+        pygame.draw.circle(canvas, _BORDER, center, self._pixels(0.055), self._pixels(0.006))
         constants = batch.constants[i]
         weight = constants[kernels.WEIGHT]
         force = constants[kernels.FRICTION] * batch.presses[i].sum()
-        # The bar ends at twice the weight.
+        # The full bar is twice the weight.
         filled = min(force / max(2.0 * weight, 1e-12), 1.0)
         left, top = self._screen(np.array([[0.66, 0.8]]))[0]
         width, height = 0.3 * self._scale, 0.035 * self._scale
-        pygame.draw.rect(canvas, colour, pygame.Rect(left, top, filled * width, height))
+        pygame.draw.rect(canvas, color, pygame.Rect(left, top, filled * width, height))
         frame = pygame.Rect(left, top, width, height)
         pygame.draw.rect(canvas, _BORDER, frame, self._pixels(0.005))
         middle = left + width / 2.0
@@ -173,7 +173,7 @@ class Renderer(Canvas):
             state = "goal found"
         else:
             state = "held" if batch.held[i] else "loose"
-        colour = _TEXT if batch.ends[i] == kernels.GOING_ON else _FAILED
+        color = _TEXT if batch.ends[i] == kernels.GOING_ON else _FAILED
         if not pygame.font.get_init():
             pygame.font.init()
         font = pygame.font.Font(None, self._pixels(0.075))
@@ -181,7 +181,7 @@ class Renderer(Canvas):
         lines = [
             (f"return {tallies[kernels.RETURN]:.1f}", _TEXT),
             (f"{seconds:.2f} s", _TEXT),
-            (state, colour),
+            (state, color),
         ]
         for text, ink in lines:
             image = font.render(text, True, ink)

@@ -1,4 +1,4 @@
-"""What the agent is paid for: one small object per task, every coefficient an argument."""
+"""The tasks, whose arguments are the coefficients of the reward."""
 
 from dataclasses import dataclass, fields
 
@@ -8,15 +8,29 @@ from numpy.typing import NDArray
 from flowpolicy_envs.checks import check_not_negative
 from flowpolicy_envs.square import kernels
 
+# Coefficient -> column of the reward terms.
+_COLUMNS = {
+    "held": kernels.HELD,
+    "failure": kernels.FAILURE,
+    "overreach": kernels.OVERREACH,
+    "safe_reach": kernels.SAFE_REACH,
+    "effort": kernels.EFFORT,
+    "angle": kernels.ANGLE,
+    "position": kernels.POSITION_BEFORE,
+    "y": kernels.Y_AFTER,
+    "goal": kernels.GOAL,
+    "radius": kernels.GOAL_RADIUS,
+}
+
 
 @dataclass(frozen=True)
 class Task:
     """Coefficients that all tasks share. Rewards are per step of the agent.
 
     Args:
-        held: Paid while the square is held.
+        held: Added while the square is held.
         failure: Subtracted when the square drops or a finger breaks.
-        angle: Subtracted per radian that the square is turned, either way.
+        angle: Subtracted per radian of the absolute angle of the square.
 
     Raises:
         ValueError: If a coefficient is negative or not finite.
@@ -32,11 +46,10 @@ class Task:
             check_not_negative(field.name, getattr(self, field.name))
 
     def terms(self) -> NDArray[np.float64]:
-        """Return the coefficients as the compiled reward reads them, (11,)."""
+        """Return the coefficients in the order of the compiled reward, (11,)."""
         terms = np.zeros(kernels.N_REWARD_TERMS)
-        terms[kernels.HELD] = self.held
-        terms[kernels.FAILURE] = self.failure
-        terms[kernels.ANGLE] = self.angle
+        for name, column in _COLUMNS.items():
+            terms[column] = getattr(self, name, 0.0)
         return terms
 
 
@@ -45,10 +58,10 @@ class Hold(Task):
     """Hold the square still in the middle of the world (thesis 3.3.2).
 
     Args:
-        position: Subtracted per world unit between the square and the middle, at all times.
-        overreach: Subtracted in proportion to how far the actions go beyond `safe_reach`,
-            averaged over their eight components; in full if all of them are at -1 or 1.
-        safe_reach: What is no overreach, as a share of the reach, in [0, 1).
+        position: Subtracted per world unit between the square and the middle.
+        overreach: Subtracted in proportion to the excess of the actions over `safe_reach`, averaged
+            over their eight components; in full if all of them are -1 or 1.
+        safe_reach: Largest action without penalty, as a share of the reach, in [0, 1).
 
     Example:
         >>> Hold(position=1.0).angle
@@ -71,36 +84,26 @@ class Hold(Task):
             raise ValueError(f"safe_reach must be less than 1, got {self.safe_reach}")
 
     def terms(self) -> NDArray[np.float64]:
-        """Return the coefficients as the compiled reward reads them, (11,)."""
+        """Return the coefficients in the order of the compiled reward, (11,)."""
         terms = super().terms()
-        terms[[kernels.POSITION_BEFORE, kernels.POSITION_AFTER]] = self.position
-        terms[kernels.OVERREACH] = self.overreach
-        terms[kernels.SAFE_REACH] = self.safe_reach
+        terms[kernels.POSITION_AFTER] = self.position
         return terms
 
 
 @dataclass(frozen=True)
 class Move(Task):
-    """Hold the square with little force; where to is left to the agent (thesis 3.3.3).
+    """Hold the square with little force; the agent may move it anywhere (thesis 3.3.3).
 
     Args:
-        effort: Subtracted times the force that controllers ask for before it is limited, as a
-            share of the limit, averaged over the fingers at the end of the step.
+        effort: Coefficient, subtracted, of the force that the controllers request before it is
+            limited, as a share of the limit, averaged over the fingers at the end of the step.
         position: Subtracted per world unit between the square and the middle during the warm-up.
-        y: Subtracted per world unit of the square's |y| after the warm-up.
+        y: Subtracted per world unit of |y| of the square after the warm-up.
     """
 
     effort: float = 0.05
     position: float = 0.5
     y: float = 0.0
-
-    def terms(self) -> NDArray[np.float64]:
-        """Return the coefficients as the compiled reward reads them, (11,)."""
-        terms = super().terms()
-        terms[kernels.EFFORT] = self.effort
-        terms[kernels.POSITION_BEFORE] = self.position
-        terms[kernels.Y_AFTER] = self.y
-        return terms
 
 
 @dataclass(frozen=True)
@@ -114,10 +117,10 @@ class MoveX(Move):
 class FindGoal(Move):
     """Find a hidden goal on the diagonal while holding the square (thesis 3.4).
 
-    The goal (u, u) is drawn anew for each episode, u uniform in [-span, span]. It is not observed.
+    Each episode draws the goal (u, u), with u uniform in [-span, span]. It is not observed.
 
     Args:
-        goal: Paid once per episode, when the square's middle comes within `radius` of the goal
+        goal: Added once per episode, when the center of the square is within `radius` of the goal
             after the warm-up.
         radius: World units.
         span: World units, at most 1.
@@ -136,13 +139,6 @@ class FindGoal(Move):
         if self.span > 1.0:
             raise ValueError(f"span must be at most 1, got {self.span}")
 
-    def terms(self) -> NDArray[np.float64]:
-        """Return the coefficients as the compiled reward reads them, (11,)."""
-        terms = super().terms()
-        terms[kernels.GOAL] = self.goal
-        terms[kernels.GOAL_RADIUS] = self.radius
-        return terms
-
 
 TASKS: dict[str, type[Task]] = {
     "hold": Hold,
@@ -150,14 +146,14 @@ TASKS: dict[str, type[Task]] = {
     "move_x": MoveX,
     "find_goal": FindGoal,
 }
-"""Names by which a task with default coefficients can be asked for, from YAML for example."""
+"""Names of the tasks with default coefficients, for YAML files for example."""
 
 
 def as_task(task: "Task | str") -> Task:
-    """Return the task, or the one with that name.
+    """Return the task itself or the task of this name.
 
     Raises:
-        ValueError: If it is neither a task nor the name of one.
+        ValueError: If it is neither a task nor the name of a task.
 
     Example:
         >>> as_task("move_x")

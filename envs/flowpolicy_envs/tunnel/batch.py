@@ -1,8 +1,11 @@
-"""The state of N Tunnels, and the two things that happen to it: resets and steps."""
+"""The state of N Tunnels, with reset and step."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowpolicy_envs.env import Generators
 from flowpolicy_envs.tunnel.config import TunnelConfig
 from flowpolicy_envs.tunnel.kernels import reset_batch, step_batch
 
@@ -10,9 +13,9 @@ from flowpolicy_envs.tunnel.kernels import reset_batch, step_batch
 class TunnelBatch:
     """N agents in tunnels of the same shape.
 
-    Both environments are thin layers over this class, the single one with N = 1, which is why
-    they agree to the last bit. The arrays below are allocated once and overwritten by each call:
-    whoever hands them on has to copy them.
+    The single and the vectorized environment use this class, the single one with N = 1, so they
+    agree bit for bit. The arrays below are allocated once and overwritten by each call: copy what
+    you keep.
 
     Args:
         config: The tunnel.
@@ -27,7 +30,7 @@ class TunnelBatch:
 
     Example:
         >>> batch = TunnelBatch(TunnelConfig(), count=2)
-        >>> batch.reset(np.ones(2, dtype=bool), np.zeros(2))
+        >>> batch.reset(batch.everyone, np.random.default_rng)
         >>> batch.step([[1.0, 1.0], [1.0, -1.0]])
         >>> batch.terminated.tolist()
         [False, True]
@@ -35,16 +38,18 @@ class TunnelBatch:
 
     def __init__(self, config: TunnelConfig, count: int) -> None:
         geometry = config.geometry
+        self._config = config
         self.everyone = np.ones(count, dtype=np.bool_)
         self.positions = np.zeros((count, geometry.dims))
         self.observations = np.zeros((count, *config.observation_space.shape), np.float32)
         self.rewards = np.zeros(count)
         self.terminated = np.zeros(count, dtype=np.bool_)
         self.success = np.zeros(count, dtype=np.bool_)
+        self._arcs = np.zeros(count)
         self._remaining = np.zeros(count)
         self._actions = np.zeros((count, geometry.dims))
         self._path = (geometry.kind, geometry.numbers, geometry.table)
-        # Collected once: building this tuple anew would cost as much as the step itself.
+        # Built once: building this tuple takes as long as a step.
         self._rules = (
             *self._path,
             config.width / 2.0,
@@ -62,24 +67,37 @@ class TunnelBatch:
             self.terminated,
             self.success,
         )
-        self.reset(self.everyone, np.zeros(count))
+        self._place(self.everyone)
 
-    def reset(self, chosen: np.ndarray, arcs: np.ndarray) -> None:
-        """Put agents on the centre line.
+    def reset(self, chosen: NDArray[np.bool_], generators: Generators) -> None:
+        """Put agents at the start.
 
         Args:
             chosen: Which agents, boolean of shape (N,).
-            arcs: Where along the path, (N,); ignored for agents that are not chosen.
+            generators: Function from the index of an agent to its random generator.
         """
-        reset_batch(*self._path, arcs, chosen, self.positions, self._remaining, self.observations)
+        if self._config.start_noise > 0.0:
+            for n in np.flatnonzero(chosen).tolist():
+                self._arcs[n] = self._config.draw_start(generators(n))
+        self._place(chosen)
+
+    def _place(self, chosen: NDArray[np.bool_]) -> None:
+        state = (self.positions, self._remaining, self.observations)
+        reset_batch(*self._path, self._arcs, chosen, *state)
         self.success[chosen] = False
 
-    def step(self, actions: ArrayLike, active: np.ndarray | None = None) -> None:
+    def step(
+        self,
+        actions: ArrayLike,
+        active: NDArray[np.bool_] | None = None,
+        generators: Generators | None = None,
+    ) -> None:
         """Move agents and overwrite the arrays with the outcome.
 
         Args:
             actions: Steps as a share of the reach, (N, D); clipped to [-1, 1].
             active: Which agents move, boolean of shape (N,); all by default.
+            generators: Not used, as steps are deterministic.
 
         Raises:
             ValueError: If `actions` has another shape or an active agent's action contains NaN.
@@ -95,6 +113,10 @@ class TunnelBatch:
         if culprit >= 0:
             raise ValueError(f"actions must not contain NaN, got {given[culprit]} at {culprit}")
 
+    def info(self, n: int) -> dict[str, Any]:
+        """Return the `info` of agent n."""
+        return {"is_success": self.success.item(n)}
+
     def infos(self) -> dict[str, NDArray]:
-        """Return what is known about the episodes: arrays (N,)."""
+        """Return new arrays (N,) with the `info` of all agents."""
         return {"is_success": self.success.copy()}

@@ -1,4 +1,4 @@
-"""The arguments of a Tunnel, checked once for the single and the vectorised environment."""
+"""The arguments of a Tunnel."""
 
 import math
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ class TunnelConfig:
             check_not_negative(name, getattr(self, name))
         if not is_number(self.goal_reward) or not math.isfinite(self.goal_reward):
             raise ValueError(f"goal_reward must be finite, got {self.goal_reward!r}")
-        # The one way round a dataclass's own freeze: this attribute follows from the others.
+        # The dataclass is frozen, and this attribute follows from the others.
         object.__setattr__(self, "geometry", self._build_path())
         to_goal = self.geometry.locate(self.geometry.point(0.0))[1]
         if self.start_noise >= to_goal:

@@ -1,11 +1,10 @@
 """Compiled geometry and dynamics of the Tunnel, for a batch of agents at once.
 
-A path reaches this module as plain numbers, because that is what compiled code takes fastest:
-`kind` says which path it is, and `numbers` and `table` describe it
-(`flowpolicy_envs.tunnel.paths` explains and builds them). Positions along a path are given by
-their *arc*: the signed length of path between them and the start.
+Plain numbers describe a path, because compiled code accepts them fastest: `kind` is the type of the
+path, `numbers` and `table` are its parameters (see `flowpolicy_envs.tunnel.paths`). The *arc* of a
+point of the path is the signed length of path between the start and the point.
 
-All of it lives in one file on purpose: numba's cache notices changes only in the file of the
+All compiled code is in one file because numba's cache only notices changes in the file of the
 function that is called.
 """
 
@@ -19,13 +18,13 @@ FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 LINE, CIRCLE, SPLINE = 0, 1, 2
 
 TOLERANCE = 1e-9
-"""Nine steps of 0.1 add up to a little less than 0.9. Rounding is decided in the agent's favour:
-this is far above the error of thousands of additions and far below any sensible width."""
+"""Nine steps of 0.1 add up to a little less than 0.9, and the agent must not fail by rounding. The
+tolerance is far above the error of thousands of additions and far below any sensible width."""
 
 
 @njit(cache=True)
 def place(kind: int, numbers: FloatArray, table: FloatArray, arc: float, out: FloatArray) -> None:
-    """Write the point of the centre line at `arc` into `out` (D,)."""
+    """Write the point of the center line at `arc` into `out` (D,)."""
     if kind == LINE:
         coupled = int(numbers[0])
         out[:] = 0.0
@@ -51,7 +50,7 @@ def _locate_line(numbers: FloatArray, position: FloatArray) -> tuple[float, floa
     for j in range(coupled):
         mean += position[j]
     mean /= coupled
-    # What is left after projecting on (1, ..., 1) is the deviation from the mean.
+    # Projecting off (1, ..., 1) leaves the deviation from the mean.
     square = 0.0
     for j in range(coupled):
         square += (position[j] - mean) ** 2
@@ -91,7 +90,7 @@ def _locate_spline(
 def locate(
     kind: int, numbers: FloatArray, table: FloatArray, position: FloatArray
 ) -> tuple[float, float]:
-    """Distance of `position` (D,) from the centre line, and length of path to the goal region.
+    """Distance of `position` (D,) from the center line, and length of path to the goal region.
 
     The second is 0 in the goal region and, on a circle, counted along the shorter way round.
     """
@@ -135,7 +134,7 @@ def reset_batch(
     remaining: FloatArray,
     observations: np.ndarray,
 ) -> None:
-    """Put the `chosen` (N,) agents on the centre line at `arcs` (N,), in place."""
+    """Put the `chosen` (N,) agents on the center line at `arcs` (N,), in place."""
     for i in range(positions.shape[0]):
         if chosen[i]:
             place(kind, numbers, table, arcs[i], positions[i])
@@ -162,9 +161,9 @@ def step_batch(
     terminated: np.ndarray,
     success: np.ndarray,
 ) -> int:
-    """Move the `active` (N,) agents by `actions` (N, D) and judge where they arrive, in place.
+    """Move the `active` (N,) agents by `actions` (N, D) and reward them, in place.
 
-    Inactive agents stay, earn nothing and do not terminate.
+    Inactive agents stay, get no reward and do not terminate.
 
     Returns:
         -1, or the index of the first active agent whose action contains NaN. In that case
@@ -185,13 +184,13 @@ def step_batch(
         for j in range(dims):
             positions[i, j] += reach * min(max(actions[i, j], -1.0), 1.0)
         offset, left = locate(kind, numbers, table, positions[i])
-        # The far end of the tunnel is open: a wall there would be a place to hide in, where any
-        # action is safe. Beyond the goal there is nothing to hide from.
+        # The tunnel is open at its end: with a wall there, any action would be safe at the wall.
+        # This does not matter beyond the goal.
         outside = left > TOLERANCE and _is_outside(kind, numbers, positions[i])
         for j in range(dims):
             positions[i, j] = min(max(positions[i, j], -1.0), 1.0)
         if outside or offset > half_width + TOLERANCE:
-            # No progress is paid here: otherwise leaping ahead out of the tunnel would pay off.
+            # Progress is not rewarded here, or leaping ahead out of the tunnel would pay off.
             rewards[i] -= leave_penalty
             terminated[i] = True
         else:

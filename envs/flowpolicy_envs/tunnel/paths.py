@@ -1,10 +1,10 @@
-r"""The paths a tunnel can follow.
+r"""The paths of tunnels.
 
-Every path has a centre line, a start on it and a goal region. Two numbers say all the dynamics
-need to know about a position: its distance from the centre line, and the length of path that
-remains to the goal region (0 inside it).
+Every path has a center line, a start on it and a goal region. The dynamics depend on a position
+only through its distance from the center line and the length of path that remains to the goal
+region (0 inside it).
 
-To the compiled code a path is a `kind`, a vector `numbers` and an array `table`:
+In compiled code a path is a `kind`, a vector `numbers` and an array `table`:
 
 | path | `numbers` | `table` |
 |---|---|---|
@@ -22,10 +22,10 @@ import numpy as np
 from flowpolicy_envs.tunnel.kernels import CIRCLE, LINE, SPLINE, FloatArray, locate, place
 
 CIRCLE_TRAVEL = 2.0 / 3.0
-"""From the start, counter-clockwise, to the middle of the goal region, in circumferences."""
+"""Way from the start, counter-clockwise, to the middle of the goal region, in circumferences."""
 
 GOAL_SHARE = 1.0 / 20.0
-"""Length of the goal region of circle and spline, as a share of the whole centre line."""
+"""Length of the goal region of circle and spline, as a share of the center line."""
 
 DEFAULT_WAYPOINTS = (
     (-0.8, -0.8),
@@ -39,17 +39,16 @@ DEFAULT_WAYPOINTS = (
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A centre line with a start (arc 0) and a goal region.
+    """A center line with a start (arc 0) and a goal region.
 
     Attributes:
-        kind: Which geometry the compiled code applies.
+        kind: Type of the path in compiled code.
         dims: Dimension D of the world.
-        numbers: Vector of parameters, see the module's table.
+        numbers: Vector of parameters, see the table of this module.
         table: Array (K, 3) of way points, or (0, 3).
         first_arc: The least arc at which an episode may start.
-        goal_arcs: Arcs between which the centre line is in the goal region, in the order in
-            which the agent meets them.
-        ends: Arcs between which the centre line runs, for drawing it.
+        goal_arcs: Arcs at which the goal region begins and ends.
+        ends: Arcs at which the center line begins and ends, for drawing it.
     """
 
     kind: int
@@ -61,7 +60,7 @@ class Path:
     ends: tuple[float, float]
 
     def point(self, arc: float) -> FloatArray:
-        """Return the point (D,) of the centre line at `arc`.
+        """Return the point (D,) of the center line at `arc`.
 
         Example:
             >>> circle_path(radius=0.5).point(0.0).tolist()
@@ -72,7 +71,7 @@ class Path:
         return out
 
     def locate(self, position: Sequence[float] | FloatArray) -> tuple[float, float]:
-        """Return the distance from the centre line and the length of path left to the goal.
+        """Return the distance from the center line and the length of path left to the goal.
 
         Args:
             position: Point (D,) of the world.
@@ -89,7 +88,7 @@ class Path:
         return locate(self.kind, self.numbers, self.table, np.asarray(position, np.float64))
 
     def polyline(self, start: float, stop: float, spacing: float = 0.01) -> FloatArray:
-        """Return points (K, D) of the centre line from arc `start` to `stop`, corners included."""
+        """Return points (K, D) of the center line from arc `start` to `stop`, corners included."""
         arcs = np.linspace(start, stop, 2 + int(abs(stop - start) / spacing))
         low, high = sorted((start, stop))
         corners = self.table[(self.table[:, 2] > low) & (self.table[:, 2] < high), 2]
@@ -99,8 +98,8 @@ class Path:
 def line_path(total_dims: int, coupled_dims: int, free_dims: int, goal_position: float) -> Path:
     """Return the line through the origin along (1, ..., 1) over the first `coupled_dims` axes.
 
-    The last `free_dims` axes are not constrained; those in between have to stay near 0. The goal
-    region begins where the line passes through `goal_position` on each coupled axis.
+    The last `free_dims` axes are unconstrained; positions must stay near 0 on those in between. The
+    goal region begins where the line passes through `goal_position` on each coupled axis.
     """
     to_goal = goal_position * math.sqrt(coupled_dims)
     to_border = math.sqrt(coupled_dims)
@@ -116,7 +115,7 @@ def line_path(total_dims: int, coupled_dims: int, free_dims: int, goal_position:
 
 
 def circle_path(radius: float) -> Path:
-    """Return the circle of `radius` about the origin, started from at angle 0."""
+    """Return the circle of `radius` about the origin, with its start at angle 0."""
     circumference = 2.0 * math.pi * radius
     goal_angle = 2.0 * math.pi * CIRCLE_TRAVEL
     half_goal = math.pi * GOAL_SHARE

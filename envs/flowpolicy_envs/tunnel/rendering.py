@@ -21,7 +21,7 @@ _AGENT = (0, 0, 0)
 _SAMPLE = (31, 119, 220, 110)
 
 _MARGIN = 1.04
-"""The picture shows the world and a little more."""
+"""Half the edge of the picture, in world units."""
 
 _LANE = 0.05
 """Half the width at which a one-dimensional world is drawn."""
@@ -30,8 +30,9 @@ _LANE = 0.05
 class Renderer(Canvas):
     """Draws the first two dimensions of a Tunnel; a one-dimensional world becomes a lane.
 
-    Red lines are walls, green is the goal region, the black disc is the agent, the grey box its
-    reach, the grey dots where it has been. Blue dots are where sampled actions would lead.
+    Red lines are walls, green is the goal region, the black disc is the agent, the gray box its
+    reach, the gray dots its past positions, and the blue dots the positions to which sampled
+    actions would lead.
 
     Args:
         config: The tunnel.
@@ -61,9 +62,9 @@ class Renderer(Canvas):
         """Draw the agent.
 
         Args:
-            canvas: Where.
+            canvas: Surface to draw on.
             trail: Positions (T, D) of this episode, T >= 1; the agent is at the last one.
-            samples: Actions (N, D) to draw around it.
+            samples: Actions (N, D) to draw around the agent.
         """
         import pygame
 
@@ -98,38 +99,33 @@ class Renderer(Canvas):
         if config.total_dims == 1:
             half_width, wall = _LANE, 0.0
         elif path.kind == LINE and config.total_dims - config.free_dims == 1:
-            # The second dimension drawn is free: nothing confines it.
+            # The second dimension is free.
             half_width, wall = self.view, 0.0
-        centre = path.polyline(*path.ends)
-        # A wide red band with a narrower white one on top leaves exactly the walls.
-        self._draw_band(canvas, _WALL, centre, half_width + wall)
-        self._draw_band(canvas, WHITE, centre, half_width)
+        center = path.polyline(*path.ends)
+        # A narrow white band on top of a wide red one leaves the walls.
+        self._draw_band(canvas, _WALL, center, half_width + wall)
+        self._draw_band(canvas, WHITE, center, half_width)
         goal = path.polyline(*path.goal_arcs)
-        self._draw_band(
-            canvas,
-            _GOAL,
-            goal,
-            half_width,
-            rounded=slice(-1, None) if path.kind == SPLINE else slice(0),
-        )
+        rounded = slice(-1, None) if path.kind == SPLINE else slice(0)
+        self._draw_band(canvas, _GOAL, goal, half_width, rounded)
 
     def _draw_band(
         self,
         canvas: "pygame.Surface",
-        colour: tuple[int, int, int],
-        centre: NDArray[np.float64],
+        color: tuple[int, int, int],
+        center: NDArray[np.float64],
         half_width: float,
         rounded: slice = slice(None),
     ) -> None:
-        """Fill what lies within `half_width` of the polyline `centre` (K, D).
+        """Fill the band within `half_width` of the polyline `center` (K, D).
 
-        Joints and ends are rounded at the points that `rounded` selects, others cut off straight.
+        Joints and ends are rounded at the points that `rounded` selects and straight elsewhere.
         """
         import pygame
 
-        if len(centre) < 2:  # A goal at the very border of the world has no extent.
+        if len(center) < 2:  # a goal at the border of the world has no extent
             return
-        points = self._screen(centre)
+        points = self._screen(center)
         radius = half_width * self._scale
         along = np.gradient(points, axis=0)
         # At a hairpin the directions cancel; the rounded joint covers the turn.
@@ -138,6 +134,6 @@ class Renderer(Canvas):
         left, right = points + across, points - across
         for k in range(len(points) - 1):
             corners = [left[k], left[k + 1], right[k + 1], right[k]]
-            pygame.draw.polygon(canvas, colour, corners)
+            pygame.draw.polygon(canvas, color, corners)
         for joint in points[rounded]:
-            pygame.draw.circle(canvas, colour, joint, radius)
+            pygame.draw.circle(canvas, color, joint, radius)

@@ -1,0 +1,101 @@
+"""Policy classes for CrossQ: sb3-contrib's, with a registered density."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, ClassVar
+
+from sb3_contrib.common.torch_layers import BatchRenorm1d
+from sb3_contrib.crossq.policies import Actor as StockCrossQActor
+from sb3_contrib.crossq.policies import CrossQPolicy
+from stable_baselines3.common.torch_layers import create_mlp
+from torch import nn
+
+from sb3_flowpolicy.policies.actor import FlowActor
+from sb3_flowpolicy.policies.off_policy import DistributionPolicy
+
+
+class CrossQFlowActor(FlowActor):
+    """:class:`FlowActor` with CrossQ's batch renormalization before and after each hidden layer.
+
+    Args:
+        *args: As for :class:`FlowActor`.
+        batch_norm: Whether to use batch renormalization.
+        batch_norm_momentum: Weight of a new batch in the running statistics.
+        batch_norm_eps: Added to variances.
+        renorm_warmup_steps: Updates before the running statistics are used.
+        **kwargs: As for :class:`FlowActor`.
+
+    References:
+        CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).
+    """
+
+    set_bn_training_mode = StockCrossQActor.set_bn_training_mode
+
+    def __init__(
+        self,
+        *args: Any,
+        batch_norm: bool = True,
+        batch_norm_momentum: float = 0.01,
+        batch_norm_eps: float = 0.001,
+        renorm_warmup_steps: int = 100_000,
+        **kwargs: Any,
+    ) -> None:
+        self._batch_norm: dict[str, Any] = {
+            "batch_norm": batch_norm,
+            "batch_norm_momentum": batch_norm_momentum,
+            "batch_norm_eps": batch_norm_eps,
+            "renorm_warmup_steps": renorm_warmup_steps,
+        }
+        super().__init__(*args, **kwargs)
+
+    def _make_latent_pi(self) -> nn.Sequential:
+        used, momentum, eps, warmup_steps = self._batch_norm.values()
+        if not used:
+            return super()._make_latent_pi()
+        norm: Any = partial(BatchRenorm1d, momentum=momentum, eps=eps, warmup_steps=warmup_steps)
+        layers = create_mlp(
+            self.features_dim, -1, self.net_arch, self.activation_fn, pre_linear_modules=[norm]
+        )
+        return nn.Sequential(*layers, *([norm(self.net_arch[-1])] if self.net_arch else []))
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._batch_norm}
+
+
+class _CrossQ(DistributionPolicy, CrossQPolicy):
+    actor_class: ClassVar[type[FlowActor]] = CrossQFlowActor
+
+
+class GaussCrossQPolicy(_CrossQ):
+    """Diagonal normal distribution, the policy of stock CrossQ."""
+
+    default_distribution = "gaussian"
+
+
+class LowRankCrossQPolicy(_CrossQ):
+    """Normal distribution with low-rank covariance, for correlated actions."""
+
+    default_distribution = "low_rank"
+
+
+class FlowCrossQPolicy(_CrossQ):
+    """Conditional RealNVP, for correlated actions and curved densities.
+
+    Example:
+        >>> from sb3_contrib import CrossQ
+        >>> kwargs = dict(net_arch=[16])
+        >>> model = CrossQ(FlowCrossQPolicy, "Pendulum-v1", policy_kwargs=kwargs, learning_starts=9)
+        >>> _ = model.learn(20)
+    """
+
+    default_distribution = "realnvp"
+
+
+# CrossQ takes neither images nor dictionaries.
+ALIASES: dict[str, Any] = {
+    "MlpPolicy": FlowCrossQPolicy,
+    "FlowPolicy": FlowCrossQPolicy,
+    "LowRankPolicy": LowRankCrossQPolicy,
+    "GaussPolicy": GaussCrossQPolicy,
+}
