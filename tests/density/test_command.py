@@ -10,9 +10,9 @@ from PIL import Image
 
 from sb3_flowpolicy.density.__main__ import main
 from sb3_flowpolicy.density.report import PICTURES
-from sb3_flowpolicy.density.results import interval, read_csv, write_csv
+from sb3_flowpolicy.density.results import read_csv, write_csv
 from sb3_flowpolicy.density.studies import FULL, STUDIES, Study, angles_to_score
-from sb3_flowpolicy.density.verdicts import angle, label, sound, two_moons
+from sb3_flowpolicy.density.verdicts import angle, interval, label, sound, two_moons
 
 Row = dict[str, object]
 
