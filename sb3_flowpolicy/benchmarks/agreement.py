@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.learning import zoo_block
-from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
@@ -91,8 +91,7 @@ def _draw(rows: list[tuple], path: Path) -> None:
     for axes, (column, label) in zip(figure.subplots(1, 2), columns.items(), strict=True):
         for how, color in {"batch": "tab:blue", "separate": "tab:orange"}.items():
             steps, values = _curves(rows, how, column)
-            axes.plot(steps, values.T, color=color, alpha=0.25, linewidth=0.8)
-            axes.plot(steps, values.mean(0), color=color, linewidth=2.2, label=f"{how}, mean")
+            draw_seeds(axes, steps, values, color, f"{how}, mean")
         axes.set(xlabel="steps per seed", ylabel=label)
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=110)

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.common.files import replacing
-from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
 from sb3_flowpolicy.policies import contrib, on_policy
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def summary(rows: Sequence[Sequence[Any]]) -> str:
 
 
 def learning_curves(rows: Sequence[Sequence[str]]) -> Figure:
-    """Draw a panel per algorithm: each seed as a thin line and the mean over seeds as a bold one.
+    """Draw the learning curves of a task, one panel per algorithm.
 
     Args:
         rows: Rows of one task. The success rate is drawn where it was measured, else the return.
@@ -222,17 +222,11 @@ def learning_curves(rows: Sequence[Sequence[str]]) -> Figure:
     axes = figure.subplots(1, len(algorithms), squeeze=False)[0]
     for panel, algorithm in zip(axes, algorithms, strict=True):
         chosen = [row for row in rows if row[1] == algorithm]
+        steps = list(dict.fromkeys(float(row[4]) for row in chosen))
         for policy in dict.fromkeys(row[2] for row in chosen):
-            curves: dict[str, list[tuple[float, float]]] = {}
-            for row in chosen:
-                if row[2] == policy:
-                    value = float(row[6] if has_success else row[5])
-                    curves.setdefault(row[3], []).append((float(row[4]), value))
-            color = _COLORS[policy]
-            for curve in curves.values():
-                panel.plot(*zip(*curve, strict=True), color=color, alpha=0.25, linewidth=0.8)
-            mean = np.mean([*curves.values()], axis=0)
-            panel.plot(*mean.T, color=color, linewidth=2, label=f"{policy} ({len(curves)})")
+            values = [float(row[6 if has_success else 5]) for row in chosen if row[2] == policy]
+            curves = np.reshape(values, (-1, len(steps)))
+            draw_seeds(panel, steps, curves, _COLORS[policy], f"{policy} ({len(curves)})")
         panel.set(title=f"{algorithm.upper()}, {chosen[0][0]}", xlabel="steps")
         panel.legend(frameon=False, fontsize=8)
         panel.spines[["top", "right"]].set_visible(False)

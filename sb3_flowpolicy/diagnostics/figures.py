@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
 
 POLICY_BLUE = "#1f6fb4"
 
@@ -21,6 +23,21 @@ def new_figure(width: float, height: float) -> Figure:
             'pictures need matplotlib: pip install "sb3_flowpolicy[zoo]"'
         ) from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def draw_seeds(axes: Axes, steps: ArrayLike, values: ArrayLike, color: str, label: str) -> None:
+    """Draw each seed as a thin line and the mean over seeds as a thick one.
+
+    Args:
+        axes: Where to draw.
+        steps: Shape (T,).
+        values: Shape (S, T).
+        color: Color of all lines.
+        label: Name of the mean in the legend.
+    """
+    values = np.asarray(values)
+    axes.plot(steps, values.T, color=color, linewidth=0.8, alpha=0.4)
+    axes.plot(steps, values.mean(0), color=color, linewidth=2.2, label=label)
 
 
 def correlation_figure(correlation: np.ndarray) -> Figure:
