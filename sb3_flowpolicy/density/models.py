@@ -102,13 +102,8 @@ class ZukoModel(FlowModel):
         self, flow: str, condition_dim: int, stackable: bool = True, **settings: Any
     ) -> None:
         super().__init__()
-        try:
-            # Imported late: it disables torch's validation of distributions in the whole process.
-            zuko = import_module("zuko")
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                'this model needs zuko: pip install "sb3_flowpolicy[experiments]"'
-            ) from error
+        # Imported late: it disables torch's validation of distributions in the whole process.
+        zuko = import_module("zuko")
         self.stackable = stackable
         self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
         self.flow = getattr(zuko.flows, flow)(2, ENCODER_UNITS if condition_dim else 0, **settings)
