@@ -1,12 +1,11 @@
 """Start-up hook that makes `python -m rl_zoo3.train --algo sac_flow` work as typed.
 
-rl_zoo3 fixes the choices of `--algo` while it is being imported and has no entry points, so a
-plug-in has to be there first. A `.pth` line calls `install` whenever Python starts; what it
-installs waits for rl_zoo3 and then calls `sb3_flowpolicy.zoo.plug_in`.
+rl_zoo3 fixes the choices of `--algo` during its import and has no entry points, so algorithms must
+be registered at that time. A `.pth` line calls `install` whenever Python starts. The installed
+finder waits for rl_zoo3 and then calls `sb3_flowpolicy.zoo.plug_in`.
 
-Every Python process of the environment runs this file. It therefore imports only what the
-interpreter has already loaded by then, annotates with builtins only, and never lets an error of
-ours reach the user's program. `SB3_FLOWPOLICY_NO_ZOO_HOOK=1` switches it off.
+Every Python process of the environment runs this file. It therefore imports only modules that the
+interpreter has already loaded and never raises. `SB3_FLOWPOLICY_NO_ZOO_HOOK=1` disables it.
 """
 
 import os
@@ -17,7 +16,7 @@ TARGETS = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager")
 
 
 class ZooFinder:
-    """Meta-path finder that lets the other finders find and notices when a target has run."""
+    """Meta-path finder that delegates to the other finders and notices when a target has run."""
 
     def __init__(self):
         self.waiting = set(TARGETS)
@@ -26,7 +25,7 @@ class ZooFinder:
         """Return the other finders' spec for a target, with its loader wrapped."""
         if name not in self.waiting:
             return None
-        # Another finder may also ask everybody else: it must not get us again.
+        # Another finder may ask all others in turn: avoid endless recursion.
         self.waiting.remove(name)
         try:
             spec = self._ask_others(name, path, target)
@@ -46,14 +45,14 @@ class ZooFinder:
         return None
 
     def plug_in(self, module):
-        """Hand a freshly run target to `sb3_flowpolicy.zoo`; leave when there is nothing to do."""
+        """Pass an imported target to `sb3_flowpolicy.zoo`; remove this finder after the last."""
         self.waiting.discard(module.__name__)
         try:
             from sb3_flowpolicy.zoo import plug_in
 
             plug_in(module)
         except Exception as error:
-            # rl_zoo3 has to keep working without us. One warning is enough.
+            # rl_zoo3 must keep working without our algorithms. One warning is enough.
             self.waiting.clear()
             import warnings
 
@@ -77,14 +76,14 @@ class NotifyingLoader:
         return getattr(self.loader, name)
 
     def exec_module(self, module):
-        """Run the module, which gets to see its real loader only, then notify."""
+        """Run the module, with its real loader in its attributes, then notify."""
         module.__spec__.loader = module.__loader__ = self.loader
         self.loader.exec_module(module)
         self.notify(module)
 
 
 def install():
-    """Put a `ZooFinder` first on the meta path, once, unless the environment says no."""
+    """Put a `ZooFinder` first on the meta path, once, unless disabled."""
     if os.environ.get(OFF_SWITCH, "0") not in ("", "0"):
         return
     if not any(isinstance(finder, ZooFinder) for finder in sys.meta_path):

@@ -1,4 +1,4 @@
-"""Transitions of someone else's making, put into the replay buffer before learning starts."""
+"""Demonstrations: recorded transitions that fill the replay buffer before learning starts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib
 import math
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,7 +25,7 @@ KEYS = ("observations", "actions", "rewards", "next_observations", "terminations
 def record_demonstrations(
     env: gym.Env, controller: Callable[[Any], np.ndarray], n_steps: int, seed: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Let a controller act and write down what happens.
+    """Record the transitions of a controller.
 
     Args:
         env: Environment with array observations.
@@ -34,11 +35,8 @@ def record_demonstrations(
 
     Returns:
         Arrays with N rows under the keys ``observations``, ``actions``, ``rewards``,
-        ``next_observations``, ``terminations`` and ``truncations``: what
-        :meth:`SACFlow.add_demonstrations` takes, and ``np.savez`` writes.
-
-    Raises:
-        ValueError: If ``n_steps`` is not positive.
+        ``next_observations``, ``terminations`` and ``truncations``, as arguments of
+        :meth:`SACFlow.add_demonstrations` or ``np.savez``.
 
     Example:
         >>> import gymnasium as gym
@@ -62,7 +60,7 @@ def record_demonstrations(
 
 
 def is_recipe(source: Any) -> bool:
-    """Return whether this says how to record demonstrations, instead of being some."""
+    """Return whether this is a recipe for :func:`follow_recipe` and not demonstrations."""
     return isinstance(source, Mapping) and "controller" in source
 
 
@@ -74,16 +72,13 @@ def follow_recipe(
     Args:
         recipe: ``controller``: function from an observation to an action, or the import path of a
             class or function that makes one, such as ``flowpolicy_envs.Holder``, with its
-            arguments under ``controller_kwargs``; ``n_steps``: number of transitions. Plain enough
-            for a YAML file.
+            arguments under ``controller_kwargs``; ``n_steps``: number of transitions. May come
+            from a YAML file.
         env: Environments that were made from registered ids.
         seed: Seed of the first reset.
 
     Returns:
         The arrays of :func:`record_demonstrations`.
-
-    Raises:
-        ValueError: If the recipe is not of this form, or the environment has no id.
 
     Example:
         >>> import flowpolicy_envs
@@ -109,26 +104,25 @@ def follow_recipe(
     spec = env.get_attr("spec")[0]
     if spec is None:
         raise ValueError("demonstrations can be recorded only in environments made from an id")
-    # Without the wrappers around it, such as SB3's Monitor, which would count these episodes.
+    # Without wrappers such as SB3's Monitor, which would count these episodes.
     kwargs = {**spec.kwargs, "render_mode": None}
     fresh = gym.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
-    try:
+    with closing(fresh):
         return record_demonstrations(fresh, controller, recipe["n_steps"], seed)
-    finally:
-        fresh.close()
 
 
 def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Read demonstrations and check that they are complete.
+    """Read and validate demonstrations.
 
     Args:
         source: Path of an ``.npz`` file, or the arrays themselves.
 
     Returns:
-        The six arrays, with as many rows each.
+        The six arrays of :func:`record_demonstrations`.
 
     Raises:
-        ValueError: If the file does not exist, an array is missing or empty, or lengths differ.
+        ValueError: If the file does not exist, an array is missing, empty or not finite, or
+            lengths differ.
     """
     if isinstance(source, Mapping):
         arrays = dict(source)
@@ -141,14 +135,15 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     missing = [key for key in KEYS if key not in arrays]
     if missing:
         raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")
-    arrays = {key: _numbers(key, arrays[key]) for key in KEYS}
-    for key in ("rewards", "terminations", "truncations"):
-        arrays[key] = arrays[key].reshape(-1)
-    for key in ("terminations", "truncations"):
-        arrays[key] = arrays[key].astype(bool)
+    arrays = {key: np.asarray(arrays[key]) for key in KEYS}
     for key, array in arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise ValueError(f"demonstrations must be numbers, got {array.dtype} in {key}")
         if not all_finite(array):
             raise ValueError(f"demonstrations must be finite, got NaN or infinity in {key}")
+    arrays["rewards"] = arrays["rewards"].reshape(-1)
+    for key in ("terminations", "truncations"):
+        arrays[key] = arrays[key].reshape(-1).astype(bool)
     lengths = {key: len(array) if array.ndim else 0 for key, array in arrays.items()}
     if len(set(lengths.values())) > 1 or not lengths["actions"]:
         raise ValueError(f"demonstrations must have equally many rows, at least 1, got {lengths}")
@@ -156,16 +151,16 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
 
 
 def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Read our arrays and no others; nothing is unpickled, nor allocated without data for it."""
+    """Read the six arrays without unpickling, and without allocating more than the file holds."""
     try:
         with zipfile.ZipFile(path) as archive:
-            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-            for name in sizes.keys() & {f"{key}.npy" for key in KEYS}:
-                with archive.open(name) as member:
-                    _check_size(member, sizes[name])
+            for entry in archive.infolist():
+                if entry.filename in {f"{key}.npy" for key in KEYS}:
+                    with archive.open(entry) as member:
+                        _check_size(member, entry.file_size)
         with np.load(path, allow_pickle=False) as file:
             return {key: file[key] for key in KEYS if key in file}
-    # Zips and arrays of someone else's making: numpy, zipfile and zlib raise what they come across.
+    # On damaged files numpy, zipfile and zlib raise many types of exceptions.
     except Exception as error:
         raise ValueError(
             f"demonstrations must be an .npz file of arrays of numbers, got {path} "
@@ -174,46 +169,34 @@ def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _check_size(file: IO[bytes], size: int) -> None:
-    """Raise ``ValueError`` if an array's head promises other than ``size`` bytes in all."""
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-    read = np.lib.format.read_array_header_2_0 if version == (2, 0) else read
-    if read is None:
-        raise ValueError(f"format version {version}")
-    shape, _, dtype = read(file)
+    """Raise ``ValueError`` if an array's header does not announce ``size`` bytes in total."""
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    shape, _, dtype = readers[np.lib.format.read_magic(file)](file)
     if dtype.hasobject or file.tell() + math.prod(shape) * dtype.itemsize != size:
         raise ValueError(f"{size} bytes for {dtype} of shape {shape}")
-
-
-def _numbers(key: str, values: Any) -> np.ndarray:
-    """Return an array, or raise ``ValueError`` if it does not hold real numbers."""
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise ValueError(f"demonstrations must have one shape per row in {key}: {error}") from error
-    if array.dtype.kind not in "biuf":
-        raise ValueError(f"demonstrations must be numbers, got {array.dtype} in {key}")
-    return array
 
 
 def fill_replay_buffer(
     buffer: ReplayBuffer, policy: BasePolicy, demonstrations: Mapping[str, np.ndarray]
 ) -> int:
-    """Append demonstrations to a replay buffer, as if the agent had lived through them.
+    """Append demonstrations to a replay buffer as if the agent had experienced them.
 
     With several environments each gets a run of consecutive rows, and up to n_envs - 1 rows at
     the end are left out.
 
     Args:
         buffer: SB3 replay buffer for array observations.
-        policy: Policy whose action space the demonstrations were recorded in.
+        policy: Policy with the spaces of the demonstrations.
         demonstrations: The six arrays of :func:`load_demonstrations`.
 
     Returns:
         Number of transitions that were added.
 
     Raises:
-        ValueError: If the buffer's kind cannot take them, or they do not fit into it.
+        ValueError: If the demonstrations do not fit the buffer or the spaces.
     """
     if isinstance(buffer, HerReplayBuffer | DictReplayBuffer) or buffer.optimize_memory_usage:
         raise ValueError(
@@ -221,47 +204,41 @@ def fill_replay_buffer(
             f"next observations, got {type(buffer).__name__} with "
             f"optimize_memory_usage={buffer.optimize_memory_usage}"
         )
-    per_env = len(demonstrations["actions"]) // buffer.n_envs
+    n_rows, n_envs = len(demonstrations["actions"]), buffer.n_envs
+    per_env = n_rows // n_envs
     if not 1 <= per_env <= buffer.buffer_size:
         raise ValueError(
-            f"demonstrations must have between {buffer.n_envs} and "
-            f"{buffer.n_envs * buffer.buffer_size} rows, got {len(demonstrations['actions'])}"
+            f"demonstrations must have between {n_envs} and {n_envs * buffer.buffer_size} rows, "
+            f"got {n_rows}"
         )
-    spaces = {
-        "observations": policy.observation_space,
-        "next_observations": policy.observation_space,
-        "actions": policy.action_space,
-    }
-    for key, space in spaces.items():
+    for key in ("observations", "next_observations", "actions"):
+        space = policy.action_space if key == "actions" else policy.observation_space
         if demonstrations[key].shape[1:] != space.shape:
             raise ValueError(
                 f"demonstrations must have {key} of shape (N, *{space.shape}), "
                 f"got {demonstrations[key].shape}"
             )
-    scaled = policy.scale_action(demonstrations["actions"])
-    if np.abs(scaled).max() > 1 + 1e-5:
+    actions = demonstrations["actions"]
+    if np.abs(policy.scale_action(actions)).max() > 1 + 1e-5:
         raise ValueError(
             f"demonstrations must have actions within {policy.action_space}, got "
-            f"{demonstrations['actions'].min()} ... {demonstrations['actions'].max()}"
+            f"{actions.min()} ... {actions.max()}"
         )
     runs = {
-        key: demonstrations[key][: per_env * buffer.n_envs]
-        .reshape(buffer.n_envs, per_env, *demonstrations[key].shape[1:])
-        .swapaxes(0, 1)
-        for key in KEYS
+        key: array[: per_env * n_envs].reshape(n_envs, per_env, *array.shape[1:]).swapaxes(0, 1)
+        for key, array in demonstrations.items()
     }
-    # The run breaks off at its end: n-step returns must not reach past it.
-    runs["truncations"] = runs["truncations"].copy()
-    runs["truncations"][-1] |= ~runs["terminations"][-1]
-    actions = policy.scale_action(runs["actions"])
+    # n-step returns must not reach past the end of a run.
+    truncations = runs["truncations"].copy()
+    truncations[-1] |= ~runs["terminations"][-1]
     for t in range(per_env):
-        terminated, truncated = runs["terminations"][t], runs["truncations"][t]
+        terminated = runs["terminations"][t]
         buffer.add(
             runs["observations"][t],
             runs["next_observations"][t],
-            actions[t],
+            policy.scale_action(runs["actions"][t]),
             runs["rewards"][t],
-            terminated | truncated,
-            [{"TimeLimit.truncated": bool(flag)} for flag in truncated & ~terminated],
+            terminated | truncations[t],
+            [{"TimeLimit.truncated": bool(flag)} for flag in truncations[t] & ~terminated],
         )
-    return per_env * buffer.n_envs
+    return per_env * n_envs

@@ -1,7 +1,7 @@
-"""`python -m sb3_flowpolicy.benchmarks.agreement`: is a batch of seeds the same as separate runs?
+"""``python -m sb3_flowpolicy.benchmarks.agreement``: a batch of seeds against separate runs.
 
-Trains the same seeds in one SeedBatch and one by one, and draws success and entropy of both.
-Random numbers differ, so curves agree in distribution, not point by point.
+Trains the same seeds in one SeedBatch and one by one, and draws the success rate and the entropy
+of both. Random numbers differ, so curves agree in distribution, not point by point.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
+from sb3_flowpolicy.benchmarks.learning import zoo_block
+from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
-ALGO, ENV = "sac_flow", "TunnelDiagonal-v0"
+ENV = "TunnelDiagonal-v0"
 COLUMNS = ("how", "seed", "step", "success", "entropy")
-EVERY = 1000
+STEPS_PER_ROW = 1000
 
 
 class Recorder(BaseCallback):
-    """Notes success of the last 100 episodes and entropy at the start, every 1000 steps."""
+    """Record the success of the last 100 episodes and the entropy at the start position."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,7 +37,7 @@ class Recorder(BaseCallback):
         self.model.recorded = self.rows  # type: ignore[attr-defined]
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % EVERY == 0:
+        if self.num_timesteps % STEPS_PER_ROW == 0:
             actor = self.model.policy.actor
             assert isinstance(actor, FlowActor)
             with th.random.fork_rng(devices=[]):
@@ -47,14 +48,10 @@ class Recorder(BaseCallback):
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train both ways, write ``agreement.csv`` and ``agreement.png``, print the summary.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-    """
+    """Train both ways, write ``agreement.csv`` and ``agreement.png``, print the summary."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.benchmarks.agreement",
-        description=(__doc__ or "").splitlines()[0],
+        description="Compare a batch of seeds with separate runs of the same seeds.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds")
@@ -62,56 +59,45 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("."), help="folder for results")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
-    settings = load_hyperparameters(ALGO, ENV)
-    del settings["n_timesteps"]
-    policy = settings.pop("policy")
+    settings = {"env": ENV, "device": "cpu", **zoo_block("sac_flow", ENV)}
 
-    rows = []
-    batch = SeedBatch(policy, ENV, args.seeds, device="cpu", **settings)
+    batch = SeedBatch(seeds=args.seeds, **settings)
     batch.learn(args.n_timesteps, callback=Recorder())
+    rows: list[tuple] = []
     for seed, model in zip(batch.seeds, batch.models, strict=True):
         rows += [("batch", seed, *row) for row in model.recorded]  # type: ignore[attr-defined]
     for seed in range(args.seeds):
-        model = SACFlow(policy, ENV, seed=seed, device="cpu", **settings)
         recorder = Recorder()
-        model.learn(args.n_timesteps, callback=recorder)
+        SACFlow(seed=seed, **settings).learn(args.n_timesteps, callback=recorder)
         rows += [("separate", seed, *row) for row in recorder.rows]
         print(f"seed {seed} done", flush=True)
     args.output.mkdir(parents=True, exist_ok=True)
     with open(args.output / "agreement.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        writer.writerows(rows)
+        csv.writer(file).writerows([COLUMNS, *rows])
     _draw(rows, args.output / "agreement.png")
-    _summarise(rows)
+    _summarize(rows)
 
 
-def _curves(rows: list, how: str, column: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps (T,) and values (S, T) of one way to train."""
+def _curves(rows: list[tuple], how: str, column: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps (T,) and values (S, T) of the batch or of the separate runs."""
     chosen = [row for row in rows if row[0] == how]
     steps = np.unique([row[2] for row in chosen])
     return steps, np.array([row[column] for row in chosen]).reshape(-1, len(steps))
 
 
-def _draw(rows: list, path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    for axes, (column, label) in zip(
-        figure.subplots(1, 2),
-        {3: "success (last 100 episodes)", 4: "entropy, nats"}.items(),
-        strict=True,
-    ):
-        for how, colour in {"batch": "tab:blue", "separate": "tab:orange"}.items():
+def _draw(rows: list[tuple], path: Path) -> None:
+    figure = new_figure(9, 3.2)
+    columns = {3: "success (last 100 episodes)", 4: "entropy, nats"}
+    for axes, (column, label) in zip(figure.subplots(1, 2), columns.items(), strict=True):
+        for how, color in {"batch": "tab:blue", "separate": "tab:orange"}.items():
             steps, values = _curves(rows, how, column)
-            axes.plot(steps, values.T, color=colour, alpha=0.25, linewidth=0.8)
-            axes.plot(steps, values.mean(0), color=colour, linewidth=2.2, label=f"{how}, mean")
+            draw_seeds(axes, steps, values, color, f"{how}, mean")
         axes.set(xlabel="steps per seed", ylabel=label)
         axes.legend(fontsize=8)
     figure.savefig(path, dpi=110)
 
 
-def _summarise(rows: list) -> None:
+def _summarize(rows: list[tuple]) -> None:
     for how in ("batch", "separate"):
         steps, success = _curves(rows, how, 3)
         solved = [steps[np.argmax(curve >= 0.9)] for curve in success if (curve >= 0.9).any()]

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -26,10 +26,14 @@ from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalizati
 from tqdm import tqdm
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.benchmarks.learning_curves import learning_curves
+from sb3_flowpolicy.common.files import replacing
+from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
 from sb3_flowpolicy.policies import crossq, on_policy, tqc
 
-CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CANDIDATES: dict[str, tuple[Any, dict[str, Any]]] = {
     "tqc": (
         TQC,
         {
@@ -59,16 +63,26 @@ CONTENDERS: dict[str, tuple[Any, dict[str, Any]]] = {
         },
     ),
 }
-"""Algorithm -> its class, and the policies that are compared."""
+"""Algorithm -> its class, and the policies to compare."""
 
-# As SB3's PPO bounds actions, where ours squash them.
+# The "-clipped" policies bound actions as SB3's PPO does, the others squash them.
 _CLIPPED = {"squash_output": False}
 _POLICY_KWARGS = {"lowrank-clipped": _CLIPPED, "flow-clipped": _CLIPPED}
+
+# As in the figures of the experiments; "stock" is the algorithm's own policy.
+_COLORS = {
+    "stock": "#000000",
+    "gauss": "#d55e00",
+    "lowrank": "#009e73",
+    "flow": "#0072b2",
+    "lowrank-clipped": "#8fd3b6",
+    "flow-clipped": "#56b4e9",
+}
 
 
 @dataclass(frozen=True)
 class Task:
-    """An environment, and for each algorithm how long and with which settings it is trained."""
+    """An environment with the number of steps and the settings of each algorithm."""
 
     env_id: str
     steps: dict[str, int]
@@ -135,40 +149,37 @@ TASKS = {
         for count in (2, 4, 8)
     },
 }
-"""What they are trained on."""
-
 COLUMNS = ("task", "algorithm", "policy", "seed", "step", "test_return", "test_success", "seconds")
-_LOOKS = 6
+_N_TESTS = 6
 
 
 def train(task: Task, algorithm: str, policy: str, seed: int, n_episodes: int) -> list[list[Any]]:
-    """Train one agent and test it six times on the way.
+    """Train one agent and test it six times during training.
 
     Args:
         task: Environment and settings.
-        algorithm: Key of ``CONTENDERS``.
+        algorithm: Key of ``CANDIDATES``.
         policy: Key of its policies.
         seed: Seed of agent and environments.
         n_episodes: Deterministic episodes per test.
 
     Returns:
-        A row of ``COLUMNS``, less the first four, for each test.
+        The last four ``COLUMNS`` of each test.
     """
-    algorithm_class, policies = CONTENDERS[algorithm]
+    algorithm_class, policies = CANDIDATES[algorithm]
     settings = dict(task.settings[algorithm])
     count = settings.pop("n_envs", 1)
     policy_kwargs = {**settings.pop("policy_kwargs", {}), **_POLICY_KWARGS.get(policy, {})}
     venv = make_vec_env(task.env_id, count, seed, env_kwargs=task.env_kwargs)
     test_venv = make_vec_env(task.env_id, 1, 10**6 + seed, env_kwargs=task.env_kwargs)
     if algorithm in task.normalize:
-        gamma = settings.get("gamma", 0.99)
-        venv = VecNormalize(venv, gamma=gamma)
+        venv = VecNormalize(venv, gamma=settings.get("gamma", 0.99))
         test_venv = VecNormalize(test_venv, training=False, norm_reward=False)
     settings |= {"policy_kwargs": policy_kwargs, "seed": seed, "device": "cpu"}
     model = algorithm_class(policies[policy], venv, **settings)
     started, rows = time.perf_counter(), []
-    for _ in range(_LOOKS):
-        model.learn(task.steps[algorithm] // _LOOKS, reset_num_timesteps=False)
+    for _ in range(_N_TESTS):
+        model.learn(task.steps[algorithm] // _N_TESTS, reset_num_timesteps=False)
         if algorithm in task.normalize:
             sync_envs_normalization(venv, test_venv)
         outcomes: list[bool] = []
@@ -199,12 +210,32 @@ def summary(rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Train what the command line asks for and is not in the file yet; print a table.
+def learning_curves(rows: Sequence[Sequence[str]]) -> Figure:
+    """Draw the learning curves of a task, one panel per algorithm.
 
     Args:
-        arguments: Command line without the program's name. Default: that of the process.
+        rows: Rows of one task. The success rate is drawn where it was measured, else the return.
     """
+    has_success = all(row[6] for row in rows)
+    algorithms = list(dict.fromkeys(row[1] for row in rows))
+    figure = new_figure(1 + 3 * len(algorithms), 3)
+    axes = figure.subplots(1, len(algorithms), squeeze=False)[0]
+    for panel, algorithm in zip(axes, algorithms, strict=True):
+        chosen = [row for row in rows if row[1] == algorithm]
+        steps = list(dict.fromkeys(float(row[4]) for row in chosen))
+        for policy in dict.fromkeys(row[2] for row in chosen):
+            values = [float(row[6 if has_success else 5]) for row in chosen if row[2] == policy]
+            curves = np.reshape(values, (-1, len(steps)))
+            draw_seeds(panel, steps, curves, _COLORS[policy], f"{policy} ({len(curves)})")
+        panel.set(title=f"{algorithm.upper()}, {chosen[0][0]}", xlabel="steps")
+        panel.legend(frameon=False, fontsize=8)
+        panel.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel("success of test episodes" if has_success else "return of test episodes")
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train the runs that the command line names and the file lacks, and print a table."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.benchmarks.algorithms",
         description="Train TQC, CrossQ and PPO with their own policies and with ours, and write "
@@ -214,39 +245,37 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("--task", choices=list(TASKS), default="pendulum")
-    add("--algorithms", choices=list(CONTENDERS), nargs="+", help="default: all of the task's")
-    policies = list(dict.fromkeys(name for _, known in CONTENDERS.values() for name in known))
-    add("--policies", choices=policies, nargs="+", help="those that an algorithm has; default: all")
+    add("--algorithms", choices=list(CANDIDATES), nargs="+", help="default: all of the task's")
+    policies = list(dict.fromkeys(name for _, known in CANDIDATES.values() for name in known))
+    add("--policies", choices=policies, nargs="+", help="default: all that an algorithm has")
     add("--seeds", type=int, nargs="+", default=[1, 2, 3])
     add("--episodes", type=int, default=10, help="episodes per test")
     add("--csv", type=Path, default=Path("algorithms.csv"))
-    add("--figure", type=Path, help="also draw the curves of the file there, as PNG")
+    add("--figure", type=Path, help="also draw the learning curves of the file, as PNG")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
     task = TASKS[args.task]
+    unknown = sorted(set(args.algorithms or []) - set(task.steps))
+    if unknown:
+        parser.error(f"--algorithms of {args.task} must be among {[*task.steps]}, got {unknown}")
     if "Bullet" in task.env_id:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
             import_module("pybullet_envs_gymnasium")
     rows = list(csv.reader(args.csv.open())) if args.csv.exists() else [list(COLUMNS)]
     done = {tuple(row[:4]) for row in rows}
-    unknown = sorted(set(args.algorithms or []) - set(task.steps))
-    if unknown:
-        parser.error(f"--algorithms of {args.task} must be among {[*task.steps]}, got {unknown}")
     runs = [
         (args.task, algorithm, policy, str(seed))
         for algorithm in args.algorithms or task.steps
-        for policy in CONTENDERS[algorithm][1]
-        if policy in (args.policies or CONTENDERS[algorithm][1])
+        for policy in CANDIDATES[algorithm][1]
+        if policy in (args.policies or CANDIDATES[algorithm][1])
         for seed in args.seeds
     ]
     for run in tqdm([run for run in runs if run not in done], file=sys.stderr):
         found = train(task, run[1], run[2], int(run[3]), args.episodes)
         rows += [[*run, *(str(value) for value in row)] for row in found]
-        draft = args.csv.with_suffix(".tmp")
-        with draft.open("w") as file:
+        with replacing(args.csv) as draft, draft.open("w") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
-        draft.replace(args.csv)
     found = [row for row in rows[1:] if row[0] == args.task]
     print(summary(found))
     if args.figure is not None:

@@ -1,7 +1,7 @@
-"""``python -m sb3_flowpolicy.benchmarks.ant``: aggressive settings on a real task, without NaN.
+"""``python -m sb3_flowpolicy.benchmarks.ant``: aggressive settings on AntBulletEnv-v0.
 
-rl_zoo3 trains SAC on AntBulletEnv-v0 with a learning rate of 7.3e-4, where expressive policies are
-said to fail. Here they get the same settings, but for what they cannot do: gSDE.
+rl_zoo3 trains SAC there with a learning rate of 7.3e-4, at which expressive policies are said to
+diverge. Ours train with the same settings, except for gSDE, and must stay finite.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
 
+from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.guard.finite import NonFiniteError
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
@@ -28,8 +28,8 @@ POLICIES = {
     "sac_lowrank": "LowRankPolicy",
     "sac_gauss": "GaussPolicy",
 }
-# rl_zoo3 2.9.2, hyperparams/sac.yml. Ours: learning_starts, 10 000 there, so that nearly all of a
-# short run are updates.
+# rl_zoo3 2.9.2, hyperparams/sac.yml, except for learning_starts (10 000 there): ours starts the
+# updates early, so that a short run has many of them.
 SETTINGS: dict[str, Any] = {
     "learning_rate": 7.3e-4,
     "buffer_size": 300_000,
@@ -43,18 +43,18 @@ SETTINGS: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [400, 300]},
     "compile": True,
 }
-STEPS_BETWEEN_LOOKS = 1000
+STEPS_PER_ROW = 1000
 COLUMNS = ("seed", "step", "updates", "episodes", "train_return", "max_parameter", "ent_coef")
 
 
 def train(algo: str, seeds: Sequence[int], steps: int, path: Path | None) -> bool:
-    """Train all seeds in lockstep, look at them every 1000 steps, and write down what was seen.
+    """Train all seeds in lockstep and record them every 1000 steps.
 
     Args:
         algo: Key of ``POLICIES``.
         seeds: Seeds.
         steps: Steps per seed.
-        path: CSV file to write, anew at each look.
+        path: CSV file, rewritten after each 1000 steps.
 
     Returns:
         Whether everything stayed finite.
@@ -63,10 +63,10 @@ def train(algo: str, seeds: Sequence[int], steps: int, path: Path | None) -> boo
         warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
         import_module("pybullet_envs_gymnasium")
     batch = SeedBatch(POLICIES[algo], ENV_ID, seeds, device="cpu", **SETTINGS)
-    rows: list[list[object]] = []
+    rows: list[tuple[object, ...]] = [COLUMNS]
     done = 0
     while done < steps:
-        stage = min(STEPS_BETWEEN_LOOKS, steps - done)
+        stage = min(STEPS_PER_ROW, steps - done)
         try:
             batch.learn(stage, reset_num_timesteps=done == 0, log_interval=None)
         except NonFiniteError as error:
@@ -77,43 +77,30 @@ def train(algo: str, seeds: Sequence[int], steps: int, path: Path | None) -> boo
             assert model.ep_info_buffer is not None
             assert model.log_ent_coef is not None
             returns = [episode["r"] for episode in model.ep_info_buffer][-10:]
-            largest = float(np.abs(model.policy.parameters_to_vector()).max())
             row = (
                 seed,
                 done,
                 model._n_updates,
                 model._episode_num,
                 f"{np.mean(returns):.1f}" if returns else "",
-                f"{largest:.3g}",
+                f"{np.abs(model.policy.parameters_to_vector()).max():.3g}",
                 f"{model.log_ent_coef.exp().item():.3g}",
             )
-            rows.append(list(row))
+            rows.append(row)
             print(*(f"{k}={v}" for k, v in zip(COLUMNS, row, strict=True)), flush=True)
         if path is not None:
-            _write(path, rows)
+            with replacing(path) as draft, draft.open("w") as file:
+                csv.writer(file, lineterminator="\n").writerows(rows)
     return True
 
 
-def _write(path: Path, rows: Sequence[Sequence[object]]) -> None:
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([COLUMNS, *rows])
-    draft = path.with_suffix(".tmp")
-    draft.write_text(text.getvalue())
-    draft.replace(path)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run what the command line asks for; the exit status says whether all stayed finite.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-    """
+    """Run the command line; the exit status is 0 if everything stayed finite."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.benchmarks.ant",
         description=f"Train several seeds on {ENV_ID} with rl_zoo3's settings for SAC (learning "
-        "rate 7.3e-4, networks of 400-300) and say whether all stayed finite. Needs the extra "
-        "[bullet].",
+        "rate 7.3e-4, networks of 400-300) and check that everything stays finite. Needs the "
+        "extra [bullet].",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--algo", choices=list(POLICIES), default="sac_flow")

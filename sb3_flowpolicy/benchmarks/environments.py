@@ -1,42 +1,37 @@
-"""Steps per second of the environments, one at a time and in batches."""
+"""Steps per second of the environments, single and in batches."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import gymnasium as gym
 
 import flowpolicy_envs
-from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
+from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
 
-# One per family of what a step computes. To add one, add its id.
+# One id for each kind of step.
 ENVIRONMENTS = ("TunnelDiagonal-v0", "TunnelCircle-v0", "TunnelSpline-v0", "SquareHold-v0")
-# A familiar environment of about the same complexity, to judge the numbers by.
-PEER = "Pendulum-v1"
+# A familiar environment of similar complexity.
+BASELINE = "Pendulum-v1"
 BATCH = 64
-# Calls of step() per piece of work: enough to hide the clock.
+# Calls of step() per piece of work, enough to make the clock's overhead negligible.
 N_CALLS = 200
 
 
-def contests(quick: bool = False) -> list[Contest]:
-    """Each environment alone and as a batch, the peer likewise; ``quick`` takes the first."""
+def benchmarks(quick: bool = False) -> list[Benchmark]:
+    """Return the baseline and each environment (``quick``: the first), single and batched."""
     flowpolicy_envs.register_envs()
-    entrants = [
-        Entrant(PEER, lambda: single(PEER)),
-        Entrant(f"{PEER}, batch of {BATCH}", lambda: batch(PEER, "sync")),
-    ]
-    for env_id in ENVIRONMENTS[:1] if quick else ENVIRONMENTS:
-
-        def one(env_id: str = env_id) -> Work:
-            return single(env_id)
-
-        def many(env_id: str = env_id) -> Work:
-            return batch(env_id, "vector_entry_point")
-
-        entrants += [Entrant(env_id, one), Entrant(f"{env_id}, batch of {BATCH}", many)]
-    return [Contest("random actions", "steps", entrants)]
+    candidates = []
+    for env_id in (BASELINE, *(ENVIRONMENTS[:1] if quick else ENVIRONMENTS)):
+        vectorization = "sync" if env_id == BASELINE else "vector_entry_point"
+        batched = partial(_batch, env_id, vectorization)
+        candidates.append(Candidate(env_id, partial(_single, env_id)))
+        candidates.append(Candidate(f"{env_id}, batch of {BATCH}", batched))
+    return [Benchmark("random actions", "steps", candidates)]
 
 
-def single(env_id: str) -> Work:
-    """Return steps of one environment, reset whenever an episode ends."""
+def _single(env_id: str) -> Work:
+    """Step one environment, with a reset after each episode."""
     env = gym.make(env_id, disable_env_checker=True)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(N_CALLS)]
@@ -52,8 +47,8 @@ def single(env_id: str) -> Work:
     return work
 
 
-def batch(env_id: str, vectorization_mode: str) -> Work:
-    """Return steps of a batch of environments, which resets itself; counts each one's steps."""
+def _batch(env_id: str, vectorization_mode: str) -> Work:
+    """Step a batch of environments that resets itself, and count the steps of each."""
     env = gym.make_vec(env_id, num_envs=BATCH, vectorization_mode=vectorization_mode)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(N_CALLS)]

@@ -3,62 +3,74 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from stable_baselines3 import SAC
 
 import flowpolicy_envs
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Work
-from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
+from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
+from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
 ENV_ID = "TunnelDiagonal-v0"
 N_SEEDS = 10
-# Steps per call of learn(), per seed: so many that setting up a call does not count.
+# Steps per call of learn() and seed, enough to make the overhead of a call negligible.
 CHUNK = 500
 QUICK_START, QUICK_CHUNK = 50, 10
 
 
-def contests(quick: bool = False) -> list[Contest]:
-    """Learning on the sparse Tunnel; ``quick`` neither compiles nor stacks."""
+def zoo_block(algorithm: str, env_id: str) -> dict[str, Any]:
+    """Return the arguments of SACFlow from the shipped hyperparameter file.
+
+    Args:
+        algorithm: ``"sac_flow"``, ``"sac_lowrank"`` or ``"sac_gauss"``.
+        env_id: Environment that the file lists.
+
+    Example:
+        >>> zoo_block("sac_gauss", "TunnelDiagonal-v0")["policy_kwargs"]["net_arch"]
+        [16, 16]
+    """
+    block = load_hyperparameters(algorithm, env_id)
+    del block["n_timesteps"]
+    return block
+
+
+def stock_block(env_id: str) -> dict[str, Any]:
+    """Return the same settings as arguments of SB3's SAC with its Gaussian policy."""
+    block = zoo_block("sac_gauss", env_id) | {"policy": "MlpPolicy"}
+    for name in ("random_steps", "critic_loss_coef"):
+        block.pop(name, None)
+    return block
+
+
+def benchmarks(quick: bool = False) -> list[Benchmark]:
+    """Return learning on the sparse Tunnel; ``quick`` neither compiles nor stacks seeds."""
     flowpolicy_envs.register_envs()
-    entrants = [Entrant("SB3 SAC", lambda: _steps_of(SAC, lambda: stock_block(ENV_ID), quick))]
+    candidates = [Candidate("SB3 SAC", lambda: _steps(SAC, stock_block(ENV_ID), quick))]
     for algorithm in ("sac_gauss", "sac_flow"):
-
-        def block(algorithm: str = algorithm) -> dict[str, Any]:
-            return zoo_block(algorithm, ENV_ID) | {"compile": not quick}
-
-        def one(block: Callable[[], dict[str, Any]] = block) -> Work:
-            return _steps_of(SACFlow, block, quick)
-
-        def batch(block: Callable[[], dict[str, Any]] = block) -> Work:
-            return _steps_of(_seed_batch, block, quick, N_SEEDS)
-
-        entrants.append(Entrant(algorithm + (", not compiled" if quick else ""), one))
+        block = zoo_block(algorithm, ENV_ID) | {"compile": not quick}
+        name = algorithm + (", not compiled" if quick else "")
+        candidates.append(Candidate(name, partial(_steps, SACFlow, block, quick)))
         if not quick:
-            entrants.append(Entrant(f"SeedBatch of {N_SEEDS} {algorithm}", batch))
-    return [Contest(f"learn() on {ENV_ID}", "steps", entrants)]
+            stacked = partial(
+                _steps, partial(SeedBatch, seeds=range(N_SEEDS)), block, n_seeds=N_SEEDS
+            )
+            candidates.append(Candidate(f"SeedBatch of {N_SEEDS} {algorithm}", stacked))
+    return [Benchmark(f"learn() on {ENV_ID}", "steps", candidates)]
 
 
-def _seed_batch(**kwargs: Any) -> Any:
-    return SeedBatch(seeds=range(N_SEEDS), algorithm=SACFlow, **kwargs)
-
-
-def _steps_of(
-    algorithm: Callable[..., Any],
-    block: Callable[[], dict[str, Any]],
-    quick: bool,
-    n_seeds: int = 1,
+def _steps(
+    algorithm: Callable[..., Any], block: dict[str, Any], quick: bool = False, n_seeds: int = 1
 ) -> Work:
-    """Return chunks of learning that count steps, after random steps and compilation."""
-    kwargs = block()
+    """Learn in chunks after random steps and compilation, and count the steps of all seeds."""
+    kwargs = dict(block)
     if quick:
         kwargs |= {key: QUICK_START for key in ("learning_starts", "random_steps") if key in kwargs}
     model = algorithm(env=ENV_ID, **kwargs)
     chunk = QUICK_CHUNK if quick else CHUNK
-    warm_up = max(kwargs["learning_starts"], kwargs.get("random_steps", 0)) + chunk
-    model.learn(warm_up)
+    model.learn(max(kwargs["learning_starts"], kwargs.get("random_steps", 0)) + chunk)
 
     def work() -> float:
         model.learn(chunk, reset_num_timesteps=False)

@@ -1,4 +1,4 @@
-"""What a benchmark leaves behind: a JSON file and a table of text."""
+"""Results of a benchmark as a JSON file and as a text table."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_flowpolicy.benchmarks.timing import Contest, Timing
+from sb3_flowpolicy.benchmarks.timing import Benchmark, Timing
 from sb3_flowpolicy.common.files import write_json
 
-# Raised whenever a field changes its meaning.
+# Increase it when a field changes its meaning.
 SCHEMA = 1
 
 
@@ -19,18 +19,18 @@ class Row:
     """One line of the table, and one object under ``"rows"`` in the JSON file.
 
     Args:
-        group: ``"updates"``, ``"learn"``, ``"environments"`` or ``"flow"``.
-        contest: Title of the contest.
-        name: Who was measured.
+        group: ``"updates"``, ``"learn"``, ``"environments"``, ``"trust"`` or ``"flow"``.
+        contest: Title of the benchmark.
+        name: Candidate.
         unit: What ``rate`` counts per second.
-        rate: Median over the rounds; None where ``note`` says why there is none.
+        rate: Median over the rounds; None if the candidate was unavailable, see ``note``.
         rates: All rounds.
-        peer: Whom it is compared with.
-        ratio: Median over the rounds of its rate over the peer's in the same round.
-        limit: Who does only what cannot be avoided; None where there is no such entrant.
-        limit_fraction: Median over the rounds of its rate over the limit's.
+        peer: Baseline, the first candidate of the benchmark.
+        ratio: Median over the rounds of the rate over the baseline's in the same round.
+        limit: Candidate that does the unavoidable work only, None without one.
+        limit_fraction: Median over the rounds of the rate over the limit's.
         warm_up_seconds: Building, compiling and the first piece of work; not part of ``rate``.
-        note: Why it was not measured.
+        note: Why the candidate was unavailable.
     """
 
     group: str
@@ -47,24 +47,24 @@ class Row:
     note: str | None
 
 
-def rows(group: str, contest: Contest, timings: Sequence[Timing]) -> list[Row]:
-    """Compare the timings of a contest with its peer and their limits."""
+def rows(group: str, benchmark: Benchmark, timings: Sequence[Timing]) -> list[Row]:
+    """Compare the timings of a benchmark with its baseline and their limits."""
     by_name = {timing.name: timing for timing in timings}
-    peer = timings[0]
+    baseline = timings[0]
     found = []
-    for entrant, timing in zip(contest.entrants, timings, strict=True):
-        limit = None if entrant.limit is None else by_name[entrant.limit]
+    for candidate, timing in zip(benchmark.candidates, timings, strict=True):
+        limit = None if candidate.limit is None else by_name[candidate.limit]
         found.append(
             Row(
                 group=group,
-                contest=contest.title,
+                contest=benchmark.title,
                 name=timing.name,
-                unit=contest.unit,
+                unit=benchmark.unit,
                 rate=timing.median,
                 rates=timing.rates,
-                peer=peer.name,
-                ratio=timing.ratio_to(peer),
-                limit=entrant.limit,
+                peer=baseline.name,
+                ratio=timing.ratio_to(baseline),
+                limit=candidate.limit,
                 limit_fraction=None if limit is None else timing.ratio_to(limit),
                 warm_up_seconds=timing.warm_up_seconds,
                 note=timing.note,
@@ -74,8 +74,8 @@ def rows(group: str, contest: Contest, timings: Sequence[Timing]) -> list[Row]:
 
 
 def table(found: Sequence[Row]) -> str:
-    """Lay out the rows of one contest as text."""
-    head = ("", "per second", "lowest-highest", "x peer", "of limit", "warm-up")
+    """Lay out the rows of one benchmark as text."""
+    head = ("", "per second", "lowest-highest", "x baseline", "of limit", "warm-up")
     lines = [head]
     for row in found:
         if row.rate is None:
@@ -91,7 +91,7 @@ def table(found: Sequence[Row]) -> str:
                 f"{row.warm_up_seconds:.1f} s",
             )
         )
-    # A note may run on into the columns that it leaves empty.
+    # A note may extend into the columns that it leaves empty.
     measured = [line for line in lines if line[2]]
     widths = [max(len(line[0]) for line in lines)]
     widths += [max(len(line[i]) for line in measured) for i in range(1, len(head))]
@@ -105,11 +105,5 @@ def table(found: Sequence[Row]) -> str:
 
 
 def write_results(path: Path, content: dict[str, Any], found: Sequence[Row]) -> None:
-    """Write machine, settings and rows.
-
-    Args:
-        path: File to write; its directory exists.
-        content: Machine and settings.
-        found: All rows so far.
-    """
+    """Write machine and settings (``content``) and all rows so far."""
     write_json(path, {"schema": SCHEMA, **content, "rows": [asdict(row) for row in found]})

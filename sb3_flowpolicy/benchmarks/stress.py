@@ -1,7 +1,7 @@
-"""``python -m sb3_flowpolicy.benchmarks.stress``: hostile data, every density, nothing but numbers.
+"""``python -m sb3_flowpolicy.benchmarks.stress``: train every density on hostile data.
 
-Each case fills a replay buffer with transitions that no environment should hand out, and trains on
-them. The tests run the same cases, briefly.
+Each case fills a replay buffer with transitions that no environment should produce, and trains on
+them. The tests run the same cases for fewer updates.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ import argparse
 import csv
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from io import StringIO
+from dataclasses import astuple, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,32 +20,29 @@ import torch as th
 from stable_baselines3.common.logger import configure
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.distributions import registered_distributions
 from sb3_flowpolicy.guard.finite import NonFiniteError
 from sb3_flowpolicy.policies import FlowActor, FlowPolicy
 
 N_TRANSITIONS, OBS_DIM = 1000, 5
-UPDATES, UPDATES_BETWEEN_LOOKS = 2000, 100
+UPDATES, UPDATES_PER_CHECK = 2000, 100
 
-# Arrays of one replay buffer, by name.
+# Name -> array of the replay buffer.
 Columns = dict[str, np.ndarray]
-
-
-def _ordinary(columns: Columns) -> None:
-    pass
 
 
 @dataclass(frozen=True)
 class Case:
-    """A way to make training hard.
+    """A condition under which training might diverge.
 
     Args:
         change: Changes ordinary transitions in place.
-        settings: Arguments of :class:`SACFlow`, beside the defaults.
+        settings: Additional arguments of :class:`SACFlow`.
         action_dim: Number of actions D.
     """
 
-    change: Callable[[Columns], None] = _ordinary
+    change: Callable[[Columns], None] = lambda columns: None
     settings: dict[str, Any] = field(default_factory=dict)
     action_dim: int = 3
 
@@ -84,11 +80,11 @@ CASES = {
     "constant observations": Case(_set("observations", "next_observations", value=1.0)),
     "observations of zero": Case(_set("observations", "next_observations", value=0.0)),
     "observations of 1e8": Case(_scale("observations", 1e8)),
-    "temperature 0": Case(settings={"ent_coef": 0.0}),
-    "temperature 1e-12": Case(settings={"ent_coef": 1e-12}),
-    "temperature 1e3": Case(settings={"ent_coef": 1e3}),
-    "learned temperature, entropy out of reach": Case(settings={"target_entropy": 1e3}),
-    "learned temperature, entropy of minus 1000": Case(settings={"target_entropy": -1e3}),
+    "entropy coefficient 0": Case(settings={"ent_coef": 0.0}),
+    "entropy coefficient 1e-12": Case(settings={"ent_coef": 1e-12}),
+    "entropy coefficient 1e3": Case(settings={"ent_coef": 1e3}),
+    "learned entropy coefficient, target 1000": Case(settings={"target_entropy": 1e3}),
+    "learned entropy coefficient, target -1000": Case(settings={"target_entropy": -1e3}),
     "saturated actions": Case(_saturate),
     "all actions the same": Case(_set("actions", value=0.3)),
     "all actions 1": Case(_set("actions", value=1.0)),
@@ -97,13 +93,13 @@ CASES = {
     "one action, saturated": Case(_saturate, action_dim=1),
     "seventeen actions": Case(action_dim=17),
     "learning rate 1e-2": Case(settings={"learning_rate": 1e-2}),
-    "all of it at once": Case(_everything, {"learning_rate": 1e-2, "batch_size": 1}),
+    "all at once": Case(_everything, {"learning_rate": 1e-2, "batch_size": 1}),
 }
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is left of a case; every number is finite, or ``failure`` says what was not."""
+    """Result of a case; ``failure`` is empty if everything stayed finite."""
 
     distribution: str
     case: str
@@ -116,7 +112,7 @@ class Outcome:
 
 
 def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
-    """Train a small agent on the transitions of a case, looking at everything as it goes.
+    """Train a small agent on the transitions of a case and check it every 100 updates.
 
     Args:
         distribution: Name of a registered density.
@@ -124,7 +120,7 @@ def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
         updates: Number of updates, a multiple of 100.
 
     Returns:
-        Extremes over all looks, one per 100 updates; ``failure`` is empty if all was finite.
+        Extremes over all checks.
 
     Example:
         >>> run_case("gaussian", "batch of 1", updates=100).failure
@@ -132,9 +128,9 @@ def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
     """
     model = _model(distribution, CASES[name])
     logs, losses, largest = [], [], 0.0
-    for done in range(0, updates, UPDATES_BETWEEN_LOOKS):
+    for done in range(0, updates, UPDATES_PER_CHECK):
         try:
-            model.train(UPDATES_BETWEEN_LOOKS, model.batch_size)
+            model.train(UPDATES_PER_CHECK, model.batch_size)
             model._guard.look()
         except NonFiniteError as error:
             return Outcome(distribution, name, done, str(error))
@@ -148,7 +144,7 @@ def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
 
 
 class _Spaces(gym.Env):
-    """Nothing but spaces: never stepped."""
+    """Only the spaces of an environment."""
 
     def __init__(self, action_dim: int) -> None:
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float32)
@@ -187,7 +183,7 @@ def _model(distribution: str, case: Case) -> SACFlow:
 
 @th.no_grad()
 def _log_probabilities(model: SACFlow) -> th.Tensor:
-    """Score fresh actions and stored ones, at observations of the buffer and far from them."""
+    """Score new and stored actions at observations from the buffer and far from them."""
     assert isinstance(model.actor, FlowActor)
     buffer = model.replay_buffer
     assert buffer is not None
@@ -202,22 +198,18 @@ def _log_probabilities(model: SACFlow) -> th.Tensor:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the matrix and print it; the exit status says whether all was finite.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-    """
+    """Run all cases and print them; the exit status is 0 if everything stayed finite."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.benchmarks.stress",
-        description="Train every registered density on hostile transitions and say whether "
-        "losses, parameters, optimizers, actions and log-probabilities stayed finite.",
+        description="Train every registered density on hostile transitions and check that "
+        "losses, parameters, optimizers, actions and log-probabilities stay finite.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--updates", type=int, default=UPDATES, help="updates per case")
     parser.add_argument("--csv", type=Path, help="also write the table to this file")
     args = parser.parse_args(arguments)
-    if args.updates < 1 or args.updates % UPDATES_BETWEEN_LOOKS:
-        parser.error(f"--updates must be a multiple of {UPDATES_BETWEEN_LOOKS}")
+    if args.updates < 1 or args.updates % UPDATES_PER_CHECK:
+        parser.error(f"--updates must be a multiple of {UPDATES_PER_CHECK}")
     th.set_num_threads(1)
     outcomes = []
     for distribution in registered_distributions():
@@ -233,21 +225,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     failed = sum(bool(outcome.failure) for outcome in outcomes)
     print(f"{len(outcomes) - failed} of {len(outcomes)} cases finite over {args.updates} updates")
     if args.csv is not None:
-        _write(args.csv, outcomes)
+        with replacing(args.csv) as draft, draft.open("w") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow([one.name for one in fields(Outcome)])
+            for outcome in outcomes:
+                values = astuple(outcome)
+                writer.writerow([f"{v:.4g}" if isinstance(v, float) else v for v in values])
     sys.exit(1 if failed else 0)
-
-
-def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
-    text = StringIO()
-    names = list(Outcome.__dataclass_fields__)
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for outcome in outcomes:
-        values = (getattr(outcome, name) for name in names)
-        writer.writerow([f"{v:.4g}" if isinstance(v, float) else v for v in values])
-    draft = path.with_suffix(".tmp")
-    draft.write_text(text.getvalue())
-    draft.replace(path)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Rates of entrants that take turns, so that a busy machine is busy for all of them."""
+"""Rates of candidates that run in turns, so that other load on the machine affects all alike."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-# A median of fewer is not worth quoting.
+# The fewest rounds whose median is worth quoting.
 MIN_ROUNDS = 5
 
-# Does a piece of work and returns how much it was, in the contest's unit (updates, steps, ...).
+# Does a piece of work and returns its amount in the benchmark's unit (updates, steps, ...).
 Work = Callable[[], float]
 Clock = Callable[[], float]
-# (what comes next, how many of all turns are done) -> None
+# (next candidate, number of turns done, number of turns in total) -> None
 Progress = Callable[[str, int, int], None]
 
 
 class UnavailableError(Exception):
-    """Raised by an entrant that cannot take part; its message becomes a note in the table."""
+    """Raised by a candidate that cannot run here; its message becomes a note in the table."""
 
 
 @dataclass(frozen=True)
-class Entrant:
+class Candidate:
     """Something whose rate is measured.
 
     Args:
-        name: What it is called in the table.
-        prepare: Builds everything and returns the work to be timed. Compiling, filling buffers
-            and so on belong here or in the first call of the work: neither is timed as work.
-        limit: Name of the entrant of the same contest that only does what cannot be avoided.
+        name: Label in the table.
+        prepare: Builds everything and returns the work to be timed. Preparation and the first
+            piece of work are the warm-up: compile and fill buffers there.
+        limit: Name of the candidate of the same benchmark that does the unavoidable work only.
     """
 
     name: str
@@ -38,23 +38,23 @@ class Entrant:
 
 
 @dataclass(frozen=True)
-class Contest:
-    """Entrants that do the same work; the first one is the peer that all are compared with."""
+class Benchmark:
+    """Candidates that do the same work; the first one is the baseline for all."""
 
     title: str
     unit: str
-    entrants: Sequence[Entrant]
+    candidates: Sequence[Candidate]
 
 
 @dataclass
 class Timing:
-    """What was measured of one entrant.
+    """Measurements of one candidate.
 
     Args:
-        name: The entrant's name.
+        name: The candidate's name.
         warm_up_seconds: Duration of preparation and of the first piece of work.
-        rates: Work per second, one number per round; empty where the entrant was unavailable.
-        note: Why it was.
+        rates: Work per second, one number per round; empty if the candidate was unavailable.
+        note: Why it was unavailable.
     """
 
     name: str
@@ -64,56 +64,53 @@ class Timing:
 
     @property
     def median(self) -> float | None:
-        """The median rate, None where nothing was measured."""
+        """Median rate, None without measurements."""
         return statistics.median(self.rates) if self.rates else None
 
     def ratio_to(self, other: Timing) -> float | None:
-        """Median over rounds of this rate over the other's: both in a round met the same load."""
+        """Median over rounds of this rate over the other's, measured under the same load."""
         if not self.rates or not other.rates:
             return None
         return statistics.median(a / b for a, b in zip(self.rates, other.rates, strict=True))
 
 
-def race(
-    contest: Contest,
+def measure(
+    benchmark: Benchmark,
     rounds: int = MIN_ROUNDS,
     turn_seconds: float = 0.5,
     clock: Clock = time.perf_counter,
     progress: Progress = lambda name, done, total: None,
 ) -> list[Timing]:
-    """Let the entrants of a contest work in turns: A B C, A B C, ...
+    """Prepare all candidates, then run them in turns (A B C, A B C, ...).
 
     Args:
-        contest: Who takes part.
-        rounds: Number of rounds, at least 5.
-        turn_seconds: An entrant repeats its work until this time has passed, above 0.
-        clock: Seconds since whenever.
-        progress: Called before each turn, and at the end.
+        benchmark: Candidates to measure.
+        rounds: Turns per candidate, at least 5.
+        turn_seconds: A turn repeats its work until this much time has passed.
+        clock: Returns seconds.
+        progress: Called before each turn and at the end.
 
     Returns:
-        One timing per entrant, in their order.
-
-    Raises:
-        ValueError: If ``rounds`` or ``turn_seconds`` is out of range.
+        One timing per candidate, in order.
 
     Example:
-        >>> counting = Entrant("counting", lambda: lambda: sum(range(9)))
-        >>> contest = Contest("how far", "numbers", [counting])
-        >>> [timing.name for timing in race(contest, turn_seconds=0.001)]
+        >>> counting = Candidate("counting", lambda: lambda: sum(range(9)))
+        >>> benchmark = Benchmark("counting", "numbers", [counting])
+        >>> [timing.name for timing in measure(benchmark, turn_seconds=0.001)]
         ['counting']
     """
     if rounds < MIN_ROUNDS:
         raise ValueError(f"rounds must be at least {MIN_ROUNDS}, got {rounds}")
     if not turn_seconds > 0:
         raise ValueError(f"turn_seconds must be above 0, got {turn_seconds}")
-    timings = [Timing(entrant.name) for entrant in contest.entrants]
+    timings = [Timing(candidate.name) for candidate in benchmark.candidates]
     total = (1 + rounds) * len(timings)
     ready: list[tuple[Timing, Work]] = []
-    for done, (entrant, timing) in enumerate(zip(contest.entrants, timings, strict=True)):
-        progress(f"{entrant.name}: warm-up", done, total)
+    for done, (candidate, timing) in enumerate(zip(benchmark.candidates, timings, strict=True)):
+        progress(f"{candidate.name}: warm-up", done, total)
         start = clock()
         try:
-            work = entrant.prepare()
+            work = candidate.prepare()
             work()
         except UnavailableError as reason:
             timing.note = str(reason)

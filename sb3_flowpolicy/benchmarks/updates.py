@@ -1,32 +1,36 @@
-"""Gradient updates per second: SACFlow against SB3's SAC, against the matrix products alone."""
+"""Gradient updates per second: SACFlow against SB3's SAC and against the matrix products alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.benchmarks.limit import products_alone
-from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, UnavailableError, Work
-from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
-from sb3_flowpolicy.engine import Engine
+from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, stock_block, zoo_block
+from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, UnavailableError, Work
+from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.policies import FlowPolicy
+from sb3_flowpolicy.seeds.setup import refuse
 
 BATCH_SIZE = 256
-# Per call of train(): as if an episode had just ended.
+# Updates per call of train(), as after an episode.
 N_UPDATES = 64
-N_SEEDS = 10
+N_CALLS = 4
 N_TRANSITIONS = 10_000
-# Units from which on products in bfloat16 are faster.
-WORTH_ROUNDING = 128
-SPARSE_TUNNEL = "TunnelDiagonal-v0"
+# Products in bfloat16 are faster from this number of units on.
+MIN_UNITS_BFLOAT16 = 128
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class Shape:
 
     @property
     def title(self) -> str:
-        """For the table."""
+        """Title of the benchmark."""
         return f"nets {self.units}-{self.units}, obs {self.obs_dim}, D = {self.action_dim}"
 
     def policy_kwargs(self, policy: str) -> dict[str, Any]:
@@ -60,96 +64,89 @@ POLICIES = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
 
 
 class Unmoved(gym.Env):
-    """Spaces without a world behind them: updates read the replay buffer only."""
+    """Only the spaces of an environment: updates read the replay buffer only."""
 
     def __init__(self, obs_dim: int, action_dim: int) -> None:
         self.observation_space = gym.spaces.Box(-1, 1, (obs_dim,), np.float32)
         self.action_space = gym.spaces.Box(-1, 1, (action_dim,), np.float32)
 
 
-def contests(quick: bool = False) -> list[Contest]:
-    """One contest per shape, and one for ten stacked seeds; ``quick`` keeps the first, shorter."""
+def benchmarks(quick: bool = False) -> list[Benchmark]:
+    """Return one benchmark per shape and one of ten stacked seeds; ``quick``: a small first one."""
     if quick:
-        return [_contest(SHAPES[0], ("GaussPolicy",))]
-    return [*(_contest(shape, POLICIES) for shape in SHAPES), _stacked_contest()]
+        return [_single_seed(SHAPES[0], ("GaussPolicy",))]
+    return [*(_single_seed(shape, POLICIES) for shape in SHAPES), _stacked_seeds()]
 
 
-def _contest(shape: Shape, policies: tuple[str, ...]) -> Contest:
-    def sac(algorithm: Callable[..., Any], policy: Any, sizes_of: str, **kwargs: Any) -> Any:
+def _single_seed(shape: Shape, policies: Sequence[str]) -> Benchmark:
+    def model(algorithm: Callable[..., Any], policy: Any, sizes_of: str, **kwargs: Any) -> Any:
         sizes = shape.policy_kwargs(sizes_of)
         return prefilled(algorithm, shape, policy=policy, policy_kwargs=sizes, **kwargs)
 
-    def stock() -> Work:
-        return updates_of(sac(SAC, "MlpPolicy", "MlpPolicy"))
-
-    def stock_with_flow() -> Work:
-        return updates_of(sac(SAC, FlowPolicy, "FlowPolicy"))
+    def updates(*args: Any, **kwargs: Any) -> Callable[[], Work]:
+        return lambda: updates_of(model(*args, **kwargs))
 
     def sbx() -> Work:
         try:
             sbx_sac = import_module("sbx").SAC
         except ModuleNotFoundError as error:
             raise UnavailableError("sbx-rl is not installed") from error
-        return updates_of(sac(sbx_sac, "MlpPolicy", "MlpPolicy"))
+        return updates_of(model(sbx_sac, "MlpPolicy", "MlpPolicy"))
 
-    entrants = [Entrant("SB3 SAC", stock, limit=_limit_name("GaussPolicy"))]
+    def limit(policy: str) -> Work:
+        return products_alone([model(SACFlow, policy, policy).policy], BATCH_SIZE, N_UPDATES)
+
+    stock = updates(SAC, "MlpPolicy", "MlpPolicy")
+    candidates = [Candidate("SB3 SAC", stock, limit=_limit_name("GaussPolicy"))]
     for policy in policies:
-
-        def ours(policy: str = policy) -> Work:
-            return updates_of(sac(SACFlow, policy, policy, compile=True))
-
-        def rounded(policy: str = policy) -> Work:
-            return updates_of(sac(SACFlow, policy, policy, compile=True, autocast=True))
-
-        entrants.append(Entrant(f"SACFlow {policy}", ours, limit=_limit_name(policy)))
-        if shape.units >= WORTH_ROUNDING and policy != "LowRankPolicy":
-            entrants.append(Entrant(f"SACFlow {policy}, bfloat16", rounded))
+        ours = updates(SACFlow, policy, policy, compile=True)
+        candidates.append(Candidate(f"SACFlow {policy}", ours, limit=_limit_name(policy)))
+        if shape.units >= MIN_UNITS_BFLOAT16 and policy != "LowRankPolicy":
+            rounded = updates(SACFlow, policy, policy, compile=True, autocast=True)
+            candidates.append(Candidate(f"SACFlow {policy}, bfloat16", rounded))
     if "FlowPolicy" in policies:
-        limit = _limit_name("FlowPolicy")
-        entrants.append(Entrant("SB3 SAC with FlowPolicy", stock_with_flow, limit=limit))
-    entrants.append(Entrant("SBX SAC", sbx))
-    for policy in policies:
-
-        def limit_of(policy: str = policy) -> Work:
-            model = sac(SACFlow, policy, policy)
-            return products_alone([model.policy], BATCH_SIZE, N_UPDATES)
-
-        entrants.append(Entrant(_limit_name(policy), limit_of))
-    return Contest(shape.title, "updates", entrants)
+        stock_with_flow = updates(SAC, FlowPolicy, "FlowPolicy")
+        name, limit_name = "SB3 SAC with FlowPolicy", _limit_name("FlowPolicy")
+        candidates.append(Candidate(name, stock_with_flow, limit=limit_name))
+    candidates.append(Candidate("SBX SAC", sbx))
+    candidates += [Candidate(_limit_name(policy), partial(limit, policy)) for policy in policies]
+    return Benchmark(shape.title, "updates", candidates)
 
 
-def _stacked_contest() -> Contest:
-    shape = SHAPES[0]
+def _stacked_seeds() -> Benchmark:
+    def models(algorithm: str) -> list[SACFlow]:
+        block = zoo_block(algorithm, ENV_ID)
+        block["compile"] = True
+        return [prefilled(SACFlow, SHAPES[0], **block, seed=seed) for seed in range(N_SEEDS)]
 
     def stock() -> Work:
-        return updates_of(prefilled(SAC, shape, **stock_block(SPARSE_TUNNEL)))
+        return updates_of(prefilled(SAC, SHAPES[0], **stock_block(ENV_ID)))
 
-    entrants = [Entrant("SB3 SAC, one seed", stock)]
+    def stacked(algorithm: str) -> Work:
+        seeds = models(algorithm)
+        runtime = EngineRuntime(seeds, refuse)
+
+        def work() -> float:
+            with runtime.running():
+                for _ in range(N_CALLS):
+                    engine = runtime.engine()
+                    assert engine is not None
+                    engine.train(engine.draw(N_UPDATES, BATCH_SIZE))
+            return N_CALLS * N_UPDATES * N_SEEDS
+
+        return work
+
+    def limit(algorithm: str) -> Work:
+        return products_alone([model.policy for model in models(algorithm)], BATCH_SIZE, N_UPDATES)
+
+    candidates = [Candidate("SB3 SAC, one seed", stock)]
     for algorithm in ("sac_gauss", "sac_flow"):
-
-        def models(algorithm: str = algorithm) -> list[SACFlow]:
-            block = zoo_block(algorithm, SPARSE_TUNNEL)
-            return [prefilled(SACFlow, shape, **block, seed=seed) for seed in range(N_SEEDS)]
-
-        def stacked(models: Callable[[], list[SACFlow]] = models) -> Work:
-            seeds = models()
-            engine = Engine(seeds, seeds[0].critic_loss_coef, compiled=True)
-
-            def work() -> float:
-                engine.train(engine.draw(N_UPDATES, BATCH_SIZE))
-                return N_UPDATES * N_SEEDS
-
-            return work
-
-        def limit_of(models: Callable[[], list[SACFlow]] = models) -> Work:
-            return products_alone([model.policy for model in models()], BATCH_SIZE, N_UPDATES)
-
-        limit = _limit_name(f"{N_SEEDS} x {algorithm}")
-        entrants += [
-            Entrant(f"{N_SEEDS} x {algorithm}, stacked", stacked, limit),
-            Entrant(limit, limit_of),
+        name = f"{N_SEEDS} x {algorithm}"
+        candidates += [
+            Candidate(f"{name}, stacked", partial(stacked, algorithm), _limit_name(name)),
+            Candidate(_limit_name(name), partial(limit, algorithm)),
         ]
-    return Contest(f"{N_SEEDS} seeds of {SPARSE_TUNNEL}'s settings", "updates", entrants)
+    return Benchmark(f"{N_SEEDS} seeds of {ENV_ID}'s settings", "updates", candidates)
 
 
 def _limit_name(of: str) -> str:
@@ -169,10 +166,63 @@ def prefilled(algorithm: Callable[..., Any], shape: Shape, **kwargs: Any) -> Any
 
 
 def updates_of(model: Any) -> Work:
-    """Return calls of ``train`` that count updates."""
+    """Call ``train`` and count updates, with ours bound to its engine as during ``learn``."""
+    learning = model._runtime.running if isinstance(model, SACFlow) else nullcontext
 
     def work() -> float:
-        model.train(gradient_steps=N_UPDATES, batch_size=BATCH_SIZE)
-        return N_UPDATES
+        with learning():
+            for _ in range(N_CALLS):
+                model.train(gradient_steps=N_UPDATES, batch_size=BATCH_SIZE)
+        return N_CALLS * N_UPDATES
+
+    return work
+
+
+def products_alone(policies: Sequence[SACPolicy], batch_size: int, n_updates: int) -> Work:
+    """Compute only the matrix products of updates: an upper bound on the rate of any update.
+
+    In each update the actor runs on the present and on the next observations, and backward once.
+    The critics run three times (targets, critic loss, actor loss) and backward twice: once for
+    their weights and once only through to the actions.
+
+    Args:
+        policies: S policies of equal shape, stacked.
+        batch_size: Transitions per update and policy.
+        n_updates: Number of updates.
+
+    Returns:
+        Work that counts updates, summed over the policies.
+    """
+    n_policies = len(policies)
+    critics = policies[0].critic.q_networks
+    # Operands and result: (copies, rows, inner) x (copies, inner, columns), or without copies.
+    products: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []
+
+    def add(left: th.Tensor, right: th.Tensor) -> None:
+        products.append((left, right, th.empty(*left.shape[:-1], right.shape[-1])))
+
+    for network, copies, forward_passes, input_gradients in (
+        (policies[0].actor, n_policies, 2, 1),
+        (critics[0], n_policies * len(critics), 3, 2),
+    ):
+        linear = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+        lead = () if copies == 1 else (copies,)
+        for i, layer in enumerate(linear):
+            inputs = th.randn(*lead, batch_size, layer.in_features)
+            weight = th.randn(*lead, layer.out_features, layer.in_features)
+            gradient = th.randn(*lead, batch_size, layer.out_features)
+            for _ in range(forward_passes):
+                add(inputs, weight.mT)
+            add(gradient.mT, inputs)
+            # The critic loss needs no gradient of the inputs, the actor loss that of the actions.
+            for _ in range(input_gradients if i > 0 else input_gradients - 1):
+                add(gradient, weight)
+
+    @th.no_grad()
+    def work() -> float:
+        for _ in range(n_updates):
+            for left, right, out in products:
+                th.matmul(left, right, out=out)
+        return n_updates * n_policies
 
     return work

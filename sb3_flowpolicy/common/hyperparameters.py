@@ -1,4 +1,4 @@
-"""Hyperparameters of the files that rl_zoo3 reads too: one source for every command."""
+"""Hyperparameters from the YAML files that rl_zoo3 also reads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-# What rl_zoo3 makes of a block, and the algorithm does not see.
+# Entries that rl_zoo3 handles itself.
 _FOR_THE_ZOO = ("callback", "env_wrapper", "normalize")
 
 
@@ -29,9 +29,8 @@ def load_hyperparameters(algo: str, env_id: str) -> dict[str, Any]:
         0.0025
     """
     folder = resources.files("zoo_hyperparams")
-    names = [file.name for file in folder.iterdir()]
-    # The other files are of algorithms that rl_zoo3 trains, and nobody else here.
-    known = sorted(name.removesuffix(".yml") for name in names if name.startswith("sac_"))
+    # The files of the other algorithms are only for rl_zoo3.
+    known = sorted(f.name[:-4] for f in folder.iterdir() if f.name.startswith("sac_"))
     if algo not in known:
         raise ValueError(f"algo must be one of {known}, got {algo!r}")
     if not isinstance(env_id, str):

@@ -5,32 +5,27 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
-import subprocess
 import sys
 import time
 from pathlib import Path
 
-import sb3_flowpolicy
-
 EPILOG = """examples:
   python -m sb3_flowpolicy.density list
   python -m sb3_flowpolicy.density run two-moons-label          one study, ten seeds
-  python -m sb3_flowpolicy.density run --quick                  everything, to see that it works
+  python -m sb3_flowpolicy.density run --quick                  everything, as a test
   python -m sb3_flowpolicy.density run --jobs 2 && python -m sb3_flowpolicy.density report
 """
 DEFAULT_FOLDER = Path("density_results")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Do what the command line says.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-    """
+    """Run the command line."""
     parser = _parser()
     args = parser.parse_args(arguments)
-    # Slow imports, which --help can do without.
+    # Slow imports that --help does not need.
     try:
+        from sb3_flowpolicy.common.files import write_text
+        from sb3_flowpolicy.common.machine import machine
         from sb3_flowpolicy.density.report import write_report
         from sb3_flowpolicy.density.run import run_studies
         from sb3_flowpolicy.density.studies import FULL, QUICK, STUDIES
@@ -41,72 +36,52 @@ def main(arguments: list[str] | None = None) -> None:
         for study in STUDIES.values():
             print(f"{study.name} ({study.claim}): {study.title}")
             print(f"  models: {', '.join(study.recipes)}")
-            print(f"  thesis: {study.thesis}\n  to hold: {study.rules}\n")
+            print(f"  thesis: {study.thesis}\n  criteria: {study.rules}\n")
         return
     try:
-        if args.action == "run":
-            begin, commit = time.monotonic(), _commit()
-            if args.seeds < 1:
-                raise ValueError(f"seeds must be at least 1, got {args.seeds}")
-            seeds = range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds))
-            run_studies(
-                args.names or list(STUDIES),
-                seeds,
-                QUICK if args.quick else FULL,
-                args.out,
-                args.jobs,
-                progress=not args.no_progress,
-            )
-            used = os.times()
-            cpu = used.user + used.system + used.children_user + used.children_system
-            wall = time.monotonic() - begin
-            took = f"{wall / 60:.1f} minutes ({cpu / 60:.1f} minutes of processor time)"
-            (args.out / "origin.txt").write_text(_origin(arguments, commit, took))
-            print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
-        else:
+        if args.action == "report":
             origin = args.out / "origin.txt"
             print(write_report(args.out, origin.read_text() if origin.exists() else ""))
+            return
+        begin, commit = time.monotonic(), machine()["commit"] or "unknown (no source tree)"
+        run_studies(
+            args.names or list(STUDIES),
+            range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds)),
+            QUICK if args.quick else FULL,
+            args.out,
+            args.jobs,
+            progress=not args.no_progress,
+        )
+        used = os.times()
+        cpu = used.user + used.system + used.children_user + used.children_system
+        wall = time.monotonic() - begin
+        took = f"{wall / 60:.1f} minutes ({cpu / 60:.1f} minutes of processor time)"
+        given = sys.argv[1:] if arguments is None else arguments
+        command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
+        write_text(args.out / "origin.txt", f"Made by `{command}` at commit {commit}, in {took}.")
+        print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
     except (ValueError, OSError) as error:
         parser.error(str(error))
-
-
-def _origin(arguments: list[str] | None, commit: str, took: str) -> str:
-    given = sys.argv[1:] if arguments is None else arguments
-    command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
-    return f"Made by `{command}` at commit {commit}, in {took}."
-
-
-def _commit() -> str:
-    """Return the commit of the source tree, or that there is none."""
-    folder = Path(sb3_flowpolicy.__file__).parent
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown (no source tree)"
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.density",
         description="Fit small normalizing flows to data in the plane, as in chapter 2.1 of the "
-        "thesis, and compare their held-out likelihood with the data's exact entropy.",
+        "thesis, and compare their held-out likelihood with the exact entropy of the data.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="list|run|report")
-    actions.add_parser("list", help="show the studies, what the thesis found, and what must hold")
+    actions.add_parser("list", help="show the studies, the thesis's findings and the criteria")
     run = actions.add_parser("run", help="fit, measure and draw; tables and pictures go to --out")
-    run.add_argument("names", nargs="*", metavar="NAME", help="studies (default: all)")
-    run.add_argument("--seeds", type=int, default=10, help="number of seeds (default: 10)")
-    run.add_argument("--first-seed", type=int, default=0, help="first of them (default: 0)")
-    run.add_argument(
-        "--quick", action="store_true", help="two seeds, hardly trained, within a minute"
-    )
-    run.add_argument(
-        "--jobs", type=int, default=1, help="models fitted at the same time (default: 1)"
-    )
-    run.add_argument("--no-progress", action="store_true", help="no progress bars")
+    add = run.add_argument
+    add("names", nargs="*", metavar="NAME", help="studies (default: all)")
+    add("--seeds", type=int, default=10, help="number of seeds (default: 10)")
+    add("--first-seed", type=int, default=0, help="first seed (default: 0)")
+    add("--quick", action="store_true", help="two seeds, hardly trained, within a minute")
+    add("--jobs", type=int, default=1, help="models fitted at the same time (default: 1)")
+    add("--no-progress", action="store_true", help="no progress bars")
     report = actions.add_parser("report", help="write README.md next to the results, and print it")
     for sub in (run, report):
         sub.add_argument(

@@ -1,8 +1,7 @@
-"""Panels that the chapter's pictures are made of. Needs matplotlib."""
+"""Panels of the chapter's pictures. Needs matplotlib."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,19 +12,19 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.stats import trim_mean
 
-from sb3_flowpolicy.density.integrate import density_picture
-from sb3_flowpolicy.density.measure import Fitted
+from sb3_flowpolicy.common.files import replacing
+from sb3_flowpolicy.density.measure import CHUNK, Fitted
 from sb3_flowpolicy.density.models import FlowModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Seed of the noise that pictures are sampled with, and of fresh points in them.
+# Seed of the noise and of the new points in pictures.
 PICTURE_SEED = 7
 DPI = 110
 
 BLUE, ORANGE, GREY = "#1f6fb4", "#d9662b", "#555555"
-COLOURS = {
+COLORS = {
     "realnvp": BLUE,
     "zuko-realnvp": "#7fb2dc",
     "maf": ORANGE,
@@ -41,7 +40,7 @@ LABELS = {
     "naf": "NAF",
     "nsf": "neural spline flow",
 }
-# One colour per quadrant of the base distribution, counter-clockwise from the upper right.
+# One color per quadrant of the base distribution, counter-clockwise from the upper right.
 QUADRANTS = ("#c0392b", "#e0a030", "#2e8b57", "#2f6db5")
 
 
@@ -56,20 +55,19 @@ def grid_of_panels(n_panels: int, n_columns: int, size: float = 2.1) -> tuple[Fi
 
 
 def draw_points(
-    axes: Axes, points: np.ndarray, extent: float, title: str, colour: str | np.ndarray = BLUE
+    axes: Axes, points: np.ndarray, extent: float, title: str, color: str | np.ndarray = BLUE
 ) -> None:
     """Scatter points (N, 2); those outside [-extent, extent] are counted in the title."""
     outside = int((np.abs(points) > extent).any(axis=1).sum())
-    axes.scatter(points[:, 0], points[:, 1], s=2.0, c=colour, linewidths=0, rasterized=True)
+    axes.scatter(points[:, 0], points[:, 1], s=2.0, c=color, linewidths=0, rasterized=True)
     axes.set(xlim=(-extent, extent), ylim=(-extent, extent))
     axes.set_title(title + (f" ({outside} outside)" if outside else ""), fontsize=8)
 
 
 def draw_density(axes: Axes, density: np.ndarray, extent: float, title: str) -> None:
-    """Show a density as brightness.
+    """Draw the square root of a density as brightness, so that thin bridges stay visible.
 
-    The square root of the density is shown, so that thin bridges are seen next to bright ridges;
-    the brightest percent of the mass may saturate.
+    The brightest percent of the pixels may saturate.
     """
     bright = np.quantile(density[density > density.max() * 1e-3], 0.99)
     box = (-extent, extent, -extent, extent)
@@ -78,23 +76,43 @@ def draw_density(axes: Axes, density: np.ndarray, extent: float, title: str) -> 
     axes.set_title(title, fontsize=8)
 
 
-def picture(model: FlowModel, condition: np.ndarray, extent: float, pixels: int) -> np.ndarray:
-    """Score every pixel of a square: (pixels, pixels)."""
-    return density_picture(model, th.from_numpy(condition).float(), extent, pixels).numpy()
+@th.no_grad()
+def density_picture(
+    model: FlowModel, condition: np.ndarray, extent: float, pixels: int
+) -> np.ndarray:
+    """Evaluate a density at the pixel centers of the square [-extent, extent]².
+
+    Args:
+        model: The density.
+        condition: Its condition, shape (C,).
+        extent: Half the width of the picture.
+        pixels: Pixels per side.
+
+    Returns:
+        Densities, shape (pixels, pixels), from the lowest y and x up.
+    """
+    scores = [
+        model(points, th.from_numpy(condition).float().expand(len(points), -1))
+        for points in pixel_centers(extent, pixels).split(CHUNK)
+    ]
+    return th.cat(scores).exp().reshape(pixels, pixels).numpy()
+
+
+def pixel_centers(extent: float, pixels: int) -> th.Tensor:
+    """Return the centers of the pixels of a square, row by row from the lowest: (pixels², 2)."""
+    center = ((th.arange(pixels) + 0.5) / pixels * 2 - 1) * extent
+    return th.cartesian_prod(center, center).flip(-1)
 
 
 def curves_figure(
     fits: Sequence[Fitted], limit: float, line: tuple[float, str] | None = None
 ) -> Figure:
-    """Draw likelihoods over epochs (thesis Fig. 2.3): every seed, and their middle.
+    """Draw likelihoods over epochs (thesis Fig. 2.3): every seed and the interquartile mean.
 
     Args:
         fits: One per model.
         limit: Entropy of the data in nats.
-        line: A level to compare with, and its name.
-
-    Returns:
-        Two panels: training sample on the left, validation sample on the right.
+        line: A level to compare with, and its label.
     """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -102,10 +120,10 @@ def curves_figure(
         for fitted in fits:
             curves = fitted.curves
             nll = (curves.train if axes is left else curves.validation).numpy()
-            colour = COLOURS[fitted.model]
-            axes.plot(curves.epoch, nll, color=colour, linewidth=0.5, alpha=0.35)
+            color = COLORS[fitted.model]
+            axes.plot(curves.epoch, nll, color=color, linewidth=0.5, alpha=0.35)
             middle = trim_mean(nll, 0.25, axis=1)
-            axes.plot(curves.epoch, middle, color=colour, label=LABELS[fitted.model])
+            axes.plot(curves.epoch, middle, color=color, label=LABELS[fitted.model])
         axes.axhline(limit, color="black", linestyle="--", linewidth=1)
         axes.annotate(
             "entropy of the data: no model can be lower",
@@ -136,26 +154,23 @@ def curves_figure(
 
 
 def layers_figure(images: Sequence[np.ndarray], start: np.ndarray) -> Figure:
-    """Draw the base samples after each layer, coloured by their quadrant (thesis Fig. 2.1).
+    """Draw the base samples after each layer, colored by their quadrant (thesis Fig. 2.1).
 
     Args:
         images: Points (N, 2) after 0, 1, ... L layers.
-        start: The base samples (N, 2), which the colours come from.
-
-    Returns:
-        A figure of three columns.
+        start: The base samples (N, 2).
     """
     quadrant = np.select(
         [(start[:, 0] >= 0) & (start[:, 1] >= 0), start[:, 1] >= 0, start[:, 0] < 0], [0, 1, 2], 3
     )
-    colours = [QUADRANTS[q] for q in quadrant]
+    colors = [QUADRANTS[q] for q in quadrant]
     figure, panels = grid_of_panels(len(images), 3)
     for index, (axes, points) in enumerate(zip(panels, images, strict=True)):
-        # Layers in between may shift and stretch everything: let each panel follow.
+        # Layers in between may shift and stretch all points: zoom each panel to its points.
         middle = points.mean(0)
         extent = 1.05 * np.quantile(np.abs(points - middle), 0.995)
         titles = {0: "base: standard normal", len(images) - 1: "after layer 8: two moons"}
-        axes.scatter(points[:, 0], points[:, 1], s=1.5, c=colours, linewidths=0, rasterized=True)
+        axes.scatter(points[:, 0], points[:, 1], s=1.5, c=colors, linewidths=0, rasterized=True)
         axes.set(
             xlim=(middle[0] - extent, middle[0] + extent),
             ylim=(middle[1] - extent, middle[1] + extent),
@@ -170,7 +185,7 @@ def picture_noise(n: int) -> th.Tensor:
 
 
 def sample(fitted: Fitted, condition: np.ndarray) -> np.ndarray:
-    """Draw one point per condition from the middle seed: (N, C) -> (N, 2)."""
+    """Draw one point per condition from the median seed: (N, C) -> (N, 2)."""
     model = fitted.ensemble.member(fitted.middle)
     with th.no_grad():
         points = model.sample(picture_noise(len(condition)), th.from_numpy(condition).float())
@@ -178,9 +193,8 @@ def sample(fitted: Fitted, condition: np.ndarray) -> np.ndarray:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture small enough to be committed, at once or not at all."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    figure.savefig(temporary, dpi=DPI, format="png")
-    # Full colour depth doubles the size of pictures that need a few dozen colours.
-    Image.open(temporary).convert("RGB").quantize(128).save(temporary, format="png", optimize=True)
-    os.replace(temporary, path)
+    """Write a PNG of 128 colors, about half the size of a full-color one."""
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=DPI, format="png")
+        image = Image.open(draft).convert("RGB").quantize(128)
+        image.save(draft, format="png", optimize=True)

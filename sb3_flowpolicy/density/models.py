@@ -1,4 +1,4 @@
-"""The models of the chapter behind one small interface: ours, and zuko's."""
+"""The models of the chapter, ours and zuko's, with one interface."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ ENCODER_UNITS = 16
 
 
 class FlowModel(nn.Module, ABC):
-    """A density over the plane, given a condition of C numbers (none where C = 0).
-
-    Calling it scores points; noise in, points out samples.
+    """A density over the plane, given a condition of C numbers (C = 0: none).
 
     Attributes:
         stackable: Whether ``torch.func.vmap`` can evaluate many copies at once.
@@ -39,16 +37,15 @@ class FlowModel(nn.Module, ABC):
 
 
 class OurRealNVP(FlowModel):
-    """The policy's own flow, with a linear encoder; without a condition its context is 1.
+    """The policy's flow with a linear encoder of the condition; without one, the context is 1.
 
     Args:
         condition_dim: Number C of conditioning variables.
 
     Example:
-        >>> import torch as th
         >>> model = OurRealNVP(condition_dim=0)
         >>> noise, none = th.randn(5, 2), th.zeros(5, 0)
-        >>> th.equal(model.sample(noise, none), noise)  # the identity, until it is trained
+        >>> th.equal(model.sample(noise, none), noise)  # the identity before training
         True
     """
 
@@ -59,15 +56,15 @@ class OurRealNVP(FlowModel):
         self.flow = RealNVP(2, context_dim, layers=LAYERS, hidden=HIDDEN)
 
     def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """Score points."""
+        """See :class:`FlowModel`."""
         return self.flow.log_prob(self.context(condition), points)
 
     def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """Draw points."""
+        """See :class:`FlowModel`."""
         return self.flow.rsample_and_log_prob(self.context(condition), noise)[0]
 
     def context(self, condition: th.Tensor) -> th.Tensor:
-        """Encode conditions (N, C): (N, 16), or (N, 1) of ones where C = 0."""
+        """Encode conditions: (N, C) -> (N, 16), or (N, 1) of ones if C = 0."""
         if self.encoder is None:
             return condition.new_ones(*condition.shape[:-1], 1)
         return self.encoder(condition)
@@ -89,16 +86,13 @@ class OurRealNVP(FlowModel):
 
 
 class ZukoModel(FlowModel):
-    """A flow of zuko's, with the same linear encoder.
+    """A flow from zuko with the same linear encoder.
 
     Args:
         flow: Name of a class in ``zuko.flows``.
         condition_dim: Number C of conditioning variables.
-        stackable: Whether ``torch.func.vmap`` copes with it.
-        **settings: Passed to that class.
-
-    Raises:
-        ModuleNotFoundError: If zuko is missing, with what to install.
+        stackable: See :class:`FlowModel`.
+        **settings: Arguments of that class.
 
     References:
         Zuko: normalizing flows in PyTorch (Rozet et al., 2022).
@@ -108,23 +102,18 @@ class ZukoModel(FlowModel):
         self, flow: str, condition_dim: int, stackable: bool = True, **settings: Any
     ) -> None:
         super().__init__()
-        try:
-            # Imported here only: it switches off torch's checks of distributions everywhere.
-            zuko = import_module("zuko")
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                'this model needs zuko: pip install "sb3_flowpolicy[experiments]"'
-            ) from error
+        # Imported late: it disables torch's validation of distributions in the whole process.
+        zuko = import_module("zuko")
         self.stackable = stackable
         self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
         self.flow = getattr(zuko.flows, flow)(2, ENCODER_UNITS if condition_dim else 0, **settings)
 
     def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """Score points."""
+        """See :class:`FlowModel`."""
         return self._given(condition).log_prob(points)
 
     def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """Draw points."""
+        """See :class:`FlowModel`."""
         return self._given(condition).transform.inv(noise)
 
     def _given(self, condition: th.Tensor) -> Any:
@@ -134,10 +123,10 @@ class ZukoModel(FlowModel):
 class ZukoNAF(ZukoModel):
     """zuko's neural autoregressive flow, with initial weights close to the identity.
 
-    Each coordinate passes a monotone network, one hidden layer of 16 units (Pyro's default). With
-    zuko's initial weights eight of them squash the plane so much that most of the training is
-    spent on undoing it. Here a network starts with an average slope of about 1 instead, and with
-    its bends spread over the data.
+    A monotone network with one hidden layer of 16 units (Pyro's default) transforms each
+    coordinate. With zuko's initial weights, eight layers compress the plane so much that most of
+    the training undoes it. Here each network starts with an average slope of about 1 and with its
+    bends spread over the data.
 
     Args:
         condition_dim: Number C of conditioning variables.
@@ -162,8 +151,8 @@ class ZukoNAF(ZukoModel):
     @staticmethod
     @th.no_grad()
     def _start_near_identity(first: Any, last: Any) -> None:
-        """Replace the weights of a monotone network's two layers, which only count absolutely."""
-        # The inputs are the coordinate and 16 signals, through which the others bend its map.
+        """Set the weights of a monotone network, which uses their absolute values."""
+        # The inputs are the coordinate and 16 signals from the other coordinates.
         first.weight[..., :1].uniform_(0.5, 2.0)
         first.weight[..., 1:].uniform_(0.0, 1.0)
         first.bias.uniform_(-2.0, 2.0)
@@ -171,13 +160,13 @@ class ZukoNAF(ZukoModel):
         last.bias.zero_()
 
 
-# Name -> (condition_dim -> model). Sizes are the thesis's; of the spline flow, which it did not
-# have, they are the library's usual three transforms of eight bins.
+# Name -> (condition_dim -> model). Sizes are the thesis's. The spline flow is not in the thesis; it
+# has zuko's usual three transforms of eight bins.
 MODELS: dict[str, Callable[[int], FlowModel]] = {
     "realnvp": OurRealNVP,
     "zuko-realnvp": lambda c: ZukoModel("RealNVP", c, transforms=LAYERS, hidden_features=HIDDEN),
     "maf": lambda c: ZukoModel("MAF", c, transforms=LAYERS, hidden_features=HIDDEN),
-    # Random orders repeat themselves half the time in the plane: some layers then add nothing.
+    # In the plane, half of the random orders repeat the previous one and add little.
     "maf-random": lambda c: ZukoModel(
         "MAF", c, transforms=LAYERS, hidden_features=HIDDEN, randperm=True
     ),
@@ -192,17 +181,12 @@ def make_model(name: str, condition_dim: int, seed: int) -> FlowModel:
     Args:
         name: A key of ``MODELS``.
         condition_dim: Number C of conditioning variables, 0 for none.
-        seed: Seed of the weights; the global random state is left as it was.
-
-    Raises:
-        ValueError: If there is no such model.
+        seed: Seed of the weights; the global random state does not change.
 
     Example:
         >>> sum(p.numel() for p in make_model("realnvp", 0, seed=0).parameters())
         1296
     """
-    if name not in MODELS:
-        raise ValueError(f"model must be one of {list(MODELS)}, got {name!r}")
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         return MODELS[name](condition_dim)

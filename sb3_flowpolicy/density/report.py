@@ -1,41 +1,42 @@
-"""A page that puts each figure next to what the thesis says, and says which claims hold."""
+"""A page with each figure, the thesis's finding about it, and the checks of its claims."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_flowpolicy.density.results import interval, read_csv
+from sb3_flowpolicy.common.files import write_text
+from sb3_flowpolicy.density.measure import Row
+from sb3_flowpolicy.density.results import read_csv
 from sb3_flowpolicy.density.studies import STUDIES, Study
-from sb3_flowpolicy.density.verdicts import CHECKS, Row, Verdict, by_model, sound
+from sb3_flowpolicy.density.verdicts import CHECKS, by_model, interval, sound
 
-# Study -> its pictures, each with a caption and with what the thesis says of it, in our words.
+# Study -> picture -> caption, and the thesis's finding in our words.
 PICTURES = {
     "two-moons": {
         "two-moons-curves.png": (
-            "Likelihood over epochs; thin: every seed, thick: interquartile mean",
+            "NLL over epochs; thin: every seed, thick: interquartile mean",
             "Fig. 2.3: RealNVP and NAF are alike after some hundred epochs, MAF learns more slowly "
-            "and stays 0.1 nats above; NAF starts out extremely high.",
+            "and stays 0.1 nats above; NAF starts extremely high.",
         ),
         "two-moons-samples.png": (
             "Data and samples of all models",
-            "Fig. 2.4: RealNVP fits well; a thin tail connects the moons, because it is hard to "
-            "split a connected mass.",
+            "Fig. 2.4: RealNVP fits well; a thin tail connects the moons, because a flow "
+            "can hardly split a connected mass.",
         ),
         "two-moons-density.png": (
             "True and fitted densities; brightness is the square root of the density",
-            "Fig. 2.5: scoring every pixel tells more than samples do.",
+            "Fig. 2.5: the density at every pixel shows more than samples.",
         ),
         "two-moons-layers.png": (
-            "After each layer of our RealNVP, coloured by the quadrant of the noise",
-            "Fig. 2.1: layer by layer, a normal distribution is stretched and wrapped into moons.",
+            "Samples after each layer of our RealNVP, colored by the quadrant of the noise",
+            "Fig. 2.1: the layers stretch and bend a normal distribution into moons.",
         ),
     },
     "two-moons-label": {
         "label-curves.png": (
-            "Likelihood over epochs",
-            "0.5 nats are reached, and training has converged, after 250 epochs.",
+            "NLL over epochs",
+            "Training converges to 0.5 nats within 250 epochs.",
         ),
         "label-samples.png": (
             "Data, samples given the label, and classification of new points by likelihood",
@@ -44,26 +45,26 @@ PICTURES = {
         ),
     },
     "angle-moons": {
-        "angles-curves.png": ("Likelihood over epochs", "Not shown there."),
+        "angles-curves.png": ("NLL over epochs", "Not shown."),
         "angles-samples.png": (
-            "Data and samples, coloured by angle",
-            "Fig. 2.8: very similar; only the tips flatten out slightly.",
+            "Data and samples, colored by angle",
+            "Fig. 2.8: very similar; only the tips are slightly flatter.",
         ),
         "angles-between.png": (
             "Densities between training angles; crosses: the true tips",
-            "Fig. 2.9: the half circle turns between every two pictures: the model does not "
-            "fall back on the nearest angle that it was trained on.",
+            "Fig. 2.9: the half circle turns from picture to picture; the model does not repeat "
+            "the nearest training angle.",
         ),
         "angles-outside.png": (
-            "Densities all the way round; crosses: the true tips",
-            "Fig. 2.10: clear half circles up to 1.57; blunter tips at 2.36; the wrong direction "
-            "at 3.14; failure at 3.93 and 4.71; vaguely a half circle again at 5.50.",
+            "Densities over the full circle; crosses: the true tips",
+            "Fig. 2.10: clear half circles up to 1.57; blunter tips at 2.36; a wrong direction "
+            "at 3.14; no half circle at 3.93 and 4.71; vaguely a half circle again at 5.50.",
         ),
         "angles-likelihood.png": (
-            "Held-out likelihood over the angle; thin: every seed",
-            "Generalises well near the training angles, at best roughly far away; not measured.",
+            "Held-out NLL over the angle; thin: every seed",
+            "Generalizes well near the training angles, at best roughly far away; not measured.",
         ),
-        "angles.gif": ("The angle turns once round", "A sequence of pictures was linked."),
+        "angles.gif": ("A full turn of the angle", "A link to a sequence of pictures."),
     },
 }
 
@@ -72,14 +73,11 @@ def write_report(folder: Path, origin: str) -> str:
     """Write ``README.md`` into a folder of results.
 
     Args:
-        folder: Where ``run`` has left its files.
-        origin: The command and the commit that made them.
+        folder: Folder that ``run`` has written to.
+        origin: The command and the commit of the results.
 
     Returns:
-        What was written.
-
-    Raises:
-        ValueError: If the folder holds no results.
+        The text.
     """
     found = [study for study in STUDIES.values() if (folder / f"{study.name}-fits.csv").exists()]
     if not found:
@@ -87,41 +85,33 @@ def write_report(folder: Path, origin: str) -> str:
     parts = [
         "# Density fitting: results",
         origin,
-        "Numbers are the interquartile mean over seeds with a 95 % bootstrap interval. *NLL* is "
-        "the negative log-likelihood of points that neither training nor the choice of the best "
-        "epoch has seen; *gap* is how far that is from the truth, measured on the same points "
-        "(the Kullback-Leibler divergence, never negative but for sampling error). All in nats. "
-        "Pictures show the seed with the middle NLL.",
+        "Numbers are the interquartile mean over seeds with a 95 % bootstrap interval, in nats. "
+        "*NLL* is the negative log-likelihood of points that were used neither for training nor "
+        "for choosing the best epoch. *Gap* is its distance to that of the true density on the "
+        "same points: the Kullback-Leibler divergence, negative only by sampling error. Pictures "
+        "show the seed with the median NLL.",
     ]
     parts += [_section(study, folder) for study in found]
     text = "\n\n".join(parts) + "\n"
-    temporary = folder / ".README.md.tmp"
-    temporary.write_text(text)
-    os.replace(temporary, folder / "README.md")
+    write_text(folder / "README.md", text)
     return text
-
-
-def verdicts(study: Study, folder: Path) -> list[Verdict]:
-    """Decide a study's rules from its files."""
-    fits = read_csv(folder / f"{study.name}-fits.csv")
-    curves = read_csv(folder / f"{study.name}-curves.csv")
-    path = folder / f"{study.name}-angles.csv"
-    angles = read_csv(path) if path.exists() else []
-    return [*CHECKS[study.name](fits, curves, angles), *sound(fits)]
 
 
 def _section(study: Study, folder: Path) -> str:
     rows = read_csv(folder / f"{study.name}-fits.csv")
+    curves = read_csv(folder / f"{study.name}-curves.csv")
+    path = folder / f"{study.name}-angles.csv"
+    angles = read_csv(path) if path.exists() else []
+    verdicts = [*CHECKS[study.name](rows, curves, angles), *sound(rows)]
     lines = [
         f"## {study.claim} `{study.name}`: {study.title}",
         f"**The thesis:** {study.thesis}",
-        f"**Entropy of the data**, the limit for every model: {rows[0]['entropy']:.3f} nats. "
+        f"**Entropy of the data**, the lower limit of the NLL: {rows[0]['entropy']:.3f} nats. "
         f"Seeds: {len({row['seed'] for row in rows})}.",
         _table(rows),
-        "| check | seen | holds |\n|---|---|---|\n"
+        "| criterion | measured | holds |\n|---|---|---|\n"
         + "\n".join(
-            f"| {one.rule} | {one.seen} | {'yes' if one.holds else '**no**'} |"
-            for one in verdicts(study, folder)
+            f"| {one.rule} | {one.seen} | {'yes' if one.holds else '**no**'} |" for one in verdicts
         ),
     ]
     lines += [

@@ -1,19 +1,14 @@
-"""Results on disk: small CSV files, written at once or not at all, and read back for the report."""
+"""Results on disk: small CSV files, written by ``run`` and read by ``report``."""
 
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy.stats import bootstrap, trim_mean
-
-from sb3_flowpolicy.density.measure import Fitted
-
-N_RESAMPLES = 2000
+from sb3_flowpolicy.common.files import replacing
+from sb3_flowpolicy.density.measure import Fitted, Row
 
 
 def write_results(fits: Sequence[Fitted], folder: Path) -> None:
@@ -42,57 +37,19 @@ def write_results(fits: Sequence[Fitted], folder: Path) -> None:
         write_csv(folder / f"{name}-angles.csv", angle_rows)
 
 
-def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows of equal columns; numbers with five significant digits after the point."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with open(temporary, "w", newline="") as file:
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows of equal columns; floats with five digits after the point."""
+    with replacing(path) as draft, draft.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
         writer.writeheader()
         for row in rows:
-            writer.writerow({key: _short(value) for key, value in row.items()})
-    os.replace(temporary, path)
+            writer.writerow({k: f"{v:.5f}" if isinstance(v, float) else v for k, v in row.items()})
 
 
-def read_csv(path: Path) -> list[dict[str, Any]]:
-    """Read rows back; what looks like a number becomes one."""
+def read_csv(path: Path) -> list[Row]:
+    """Read rows; texts that look like numbers become numbers."""
     with open(path, newline="") as file:
         return [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
-
-
-def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the interquartile mean over seeds and its 95 % bootstrap interval.
-
-    Args:
-        values: One number per seed.
-
-    Returns:
-        Mean of the middle half, and both ends of the percentile interval. Not finite where a
-        seed is not.
-
-    References:
-        Deep Reinforcement Learning at the Edge of the Statistical Precipice (Agarwal et al., 2021).
-
-    Example:
-        >>> centre, low, high = interval([1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 99.0])
-        >>> print(f"{centre:.2f}", 1.0 < low < centre < high)
-        1.35 True
-    """
-    data = np.asarray(values, dtype=float)
-
-    def middle(sample: np.ndarray, axis: int = -1) -> np.ndarray:
-        return trim_mean(sample, 0.25, axis=axis)
-
-    centre = float(middle(data))
-    if len(data) < 2 or not np.isfinite(data).all() or np.ptp(data) == 0:
-        return centre, centre, centre
-    ends = bootstrap(
-        (data,), middle, n_resamples=N_RESAMPLES, method="percentile", rng=0
-    ).confidence_interval
-    return centre, float(ends.low), float(ends.high)
-
-
-def _short(value: Any) -> Any:
-    return f"{value:.5f}" if isinstance(value, float) else value
 
 
 def _number(text: str) -> Any:

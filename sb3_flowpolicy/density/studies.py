@@ -1,4 +1,4 @@
-"""What the chapter measures: one entry per study, with the thesis's finding and our rule."""
+"""The studies of the chapter, each with the thesis's findings and our criteria."""
 
 from __future__ import annotations
 
@@ -7,22 +7,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sb3_flowpolicy.density.datasets import TRAINING_ANGLES, AngleMoons, DataSet, TwoMoons
+from sb3_flowpolicy.density.datasets import (
+    TRAINING_ANGLES,
+    AngleMoons,
+    DataSet,
+    TwoMoons,
+    angle_condition,
+)
 from sb3_flowpolicy.density.fit import Recipe
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is computed around the fits.
+    """Amount of computation.
 
     Args:
-        n_validation: Points per seed that decide which weights are kept.
-        n_heldout: Points per seed whose likelihood is reported.
+        n_validation: Points per seed that select the weights.
+        n_heldout: Points per seed for the reported likelihood.
         n_per_angle: Held-out points per seed and angle.
         angle_step: Distance in radian between the angles scored outside the trained range.
         cells: Grid points per axis of each integral.
-        integral_angles: Angles, spread over the full turn, whose densities are integrated.
-        shrink: Epochs are divided by this.
+        integral_angles: Number of angles, over the full circle, whose densities are integrated.
+        shrink: Divisor of the number of epochs.
         frames: Frames of the animation.
         pixels: Pixels per side of a density picture.
     """
@@ -39,7 +45,7 @@ class Scale:
 
 
 FULL = Scale()
-# Shows that everything works, not what it finds.
+# For tests of the command; the results mean nothing.
 QUICK = Scale(
     n_validation=200,
     n_heldout=500,
@@ -58,14 +64,14 @@ class Study:
     """An experiment of the chapter.
 
     Args:
-        name: What the command line calls it.
-        claim: Its number among the thesis's claims.
-        title: A line for people.
-        data: Makes the data set.
-        recipes: Model -> how it is trained; the first model is the one that is drawn.
-        thesis: What the thesis found, in our words.
-        rules: What has to hold, in words; ``report`` decides each.
-        conditions: Conditions of the densities to integrate: a scale -> shape (K, C).
+        name: Name on the command line.
+        claim: Number among the thesis's claims.
+        title: One line.
+        data: Creates the data set.
+        recipes: Model -> its training; the first model is drawn in most pictures.
+        thesis: The thesis's findings in our words.
+        rules: Criteria in words; ``report`` checks each.
+        conditions: Scale -> conditions (K, C) of the densities to integrate.
     """
 
     name: str
@@ -84,8 +90,7 @@ class Study:
 
 
 def _angles(scale: Scale) -> np.ndarray:
-    angle = np.arange(scale.integral_angles) * 2 * np.pi / scale.integral_angles
-    return np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    return angle_condition(np.arange(scale.integral_angles) * 2 * np.pi / scale.integral_angles)
 
 
 STUDIES = {
@@ -101,19 +106,16 @@ STUDIES = {
                 "zuko-realnvp": Recipe(epochs=1000),
                 "maf": Recipe(epochs=1000),
                 "maf-random": Recipe(epochs=1000),
-                # A step of these costs several times as much.
+                # A step takes several times as long.
                 "naf": Recipe(epochs=600),
                 "nsf": Recipe(epochs=500),
             },
             thesis=(
-                "RealNVP and NAF end up at about the same likelihood and MAF 0.1 nats above them; "
-                "NAF starts extremely high and is best after about 500 epochs. A thin bridge of "
-                "probability joins the two moons."
+                "RealNVP and NAF reach about the same NLL, MAF ends 0.1 nats above them. NAF "
+                "starts extremely high and is best after about 500 epochs. A thin bridge of "
+                "probability connects the two moons."
             ),
-            rules=(
-                "RealNVP at least 0.05 nats below MAF; NAF at most 0.05 nats above RealNVP, or "
-                "below it"
-            ),
+            rules=("RealNVP at least 0.05 nats below MAF; NAF at most 0.05 nats above RealNVP"),
             conditions=lambda scale: np.zeros((1, 0)),
         ),
         Study(
@@ -123,27 +125,27 @@ STUDIES = {
             data=lambda: TwoMoons(labelled=True),
             recipes={"realnvp": Recipe(epochs=250)},
             thesis=(
-                "The likelihood reaches 0.5 nats, less than half of the best unconditional "
-                "flow's, within 250 epochs; the samples look like the data; new points can be "
-                "classified by comparing their likelihoods under both labels."
+                "The NLL reaches 0.5 nats within 250 epochs, less than half of the best "
+                "unconditional flow's. The samples look like the data. Comparing the likelihoods "
+                "of a point under both labels classifies it."
             ),
-            rules="at most 0.5 nats within 250 epochs; at least 99 % classified rightly",
+            rules="at most 0.5 nats within 250 epochs; at least 99 % classified correctly",
             conditions=lambda scale: np.array([[0.0], [1.0]]),
         ),
         Study(
             name="angle-moons",
             claim="D3",
-            title="Between and beyond the angles it was trained on (thesis 2.1.3, Fig. 2.8-2.10)",
+            title="Between and beyond the training angles (thesis 2.1.3, Fig. 2.8-2.10)",
             data=AngleMoons,
             recipes={"realnvp": Recipe(epochs=300)},
             thesis=(
-                "Samples look like the data at all 22 angles. Between the training angles the "
-                "half circle turns smoothly, as it should; outside their range it loses its "
-                "shape, the more the further away."
+                "Samples look like the data at all 22 angles. Between the training angles the half "
+                "circle turns smoothly. Outside their range it loses its shape, increasingly with "
+                "the distance."
             ),
             rules=(
-                "likelihood between training angles within 0.05 nats of that at training angles; "
-                "it worsens steadily over the first radian outside"
+                "NLL between training angles within 0.05 nats of that at training angles; NLL "
+                "rises steadily over the first radian outside"
             ),
             conditions=_angles,
         ),
@@ -154,7 +156,7 @@ STUDIES = {
 def angles_to_score(scale: Scale) -> dict[str, np.ndarray]:
     """Return the angles whose held-out likelihood is measured, by kind.
 
-    ``outside`` goes once round the circle from the last training angle back to the first.
+    ``outside`` covers the circle from the last training angle back to the first.
     """
     between = (TRAINING_ANGLES[:-1] + TRAINING_ANGLES[1:]) / 2
     outside = np.arange(2.1 + scale.angle_step, 2 * np.pi - scale.angle_step / 2, scale.angle_step)

@@ -1,51 +1,47 @@
-"""What the thesis found, asked of our results: each check says what it saw and whether it holds."""
+"""Checks of the results against the thesis's findings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.stats import spearmanr
 
+from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
 from sb3_flowpolicy.density.datasets import TRAINING_ANGLES
-from sb3_flowpolicy.density.results import interval
+from sb3_flowpolicy.density.measure import Row
 
-Row = dict[str, Any]
-# A fitted density may be this far from 1 on the grid.
+# Tolerance of a density's integral on the grid.
 INTEGRAL_TOLERANCE = 0.01
-# No model may be closer to the truth than minus this many standard errors.
+# A gap may be negative by at most this many standard errors.
 SAMPLING_ERRORS = 4.0
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One check.
-
-    Args:
-        rule: What should hold.
-        seen: What was measured.
-        holds: Whether it does.
-    """
+    """A criterion, the measured value, and whether the criterion holds."""
 
     rule: str
     seen: str
     holds: bool
 
 
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the interquartile mean over seeds and its 95 % bootstrap interval."""
+    estimate = bootstrap_interquartile_mean(np.asarray(values, dtype=float), seed=0)
+    return float(estimate.value), float(estimate.low), float(estimate.high)
+
+
 def sound(rows: Sequence[Row]) -> list[Verdict]:
-    """Check that every fitted density is one, and that none is better than the truth.
+    """Check that each fitted density integrates to 1 and that none beats the true density.
 
     Args:
         rows: Rows of a study's ``fits.csv``.
-
-    Returns:
-        Two verdicts per model.
     """
     found = []
     for model, own in by_model(rows).items():
-        # numpy's extremes, unlike Python's, do not lose a NaN: it fails the comparison.
+        # numpy's min and max, unlike Python's, return NaN, which fails the comparison.
         low = np.min([row["integral_low"] for row in own])
         high = np.max([row["integral_high"] for row in own])
         found.append(
@@ -68,28 +64,28 @@ def sound(rows: Sequence[Row]) -> list[Verdict]:
 
 def two_moons(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
     """D1: RealNVP against MAF and NAF."""
-    nll = {model: interval([row["nll"] for row in own]) for model, own in by_model(rows).items()}
-    ours = nll["realnvp"][0]
+    nll = {model: interval([row["nll"] for row in own])[0] for model, own in by_model(rows).items()}
+    above = {model: value - nll["realnvp"] for model, value in nll.items()}
     return [
         Verdict(
             "RealNVP at least 0.05 nats below MAF",
-            f"{ours - nll['maf'][0]:+.3f} nats",
-            ours <= nll["maf"][0] - 0.05,
+            f"{-above['maf']:+.3f} nats",
+            nll["realnvp"] <= nll["maf"] - 0.05,
         ),
         Verdict(
             "RealNVP at least 0.05 nats below MAF with random orders",
-            f"{ours - nll['maf-random'][0]:+.3f} nats",
-            ours <= nll["maf-random"][0] - 0.05,
+            f"{-above['maf-random']:+.3f} nats",
+            nll["realnvp"] <= nll["maf-random"] - 0.05,
         ),
         Verdict(
             "NAF at most 0.05 nats above RealNVP",
-            f"{nll['naf'][0] - ours:+.3f} nats",
-            nll["naf"][0] <= ours + 0.05,
+            f"{above['naf']:+.3f} nats",
+            nll["naf"] <= nll["realnvp"] + 0.05,
         ),
         Verdict(
             "zuko's RealNVP within 0.05 nats of ours",
-            f"{nll['zuko-realnvp'][0] - ours:+.3f} nats",
-            abs(nll["zuko-realnvp"][0] - ours) <= 0.05,
+            f"{above['zuko-realnvp']:+.3f} nats",
+            abs(above["zuko-realnvp"]) <= 0.05,
         ),
     ]
 
@@ -106,7 +102,7 @@ def label(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> 
             interval(nll)[0] <= 0.5 and epochs <= 250,
         ),
         Verdict(
-            "at least 99 % of new points classified rightly",
+            "at least 99 % of new points classified correctly",
             f"{interval(accuracy)[0]:.2%}, worst seed {min(accuracy):.2%}",
             interval(accuracy)[0] >= 0.99,
         ),
@@ -115,12 +111,13 @@ def label(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> 
 
 def angle(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
     """D3: between the training angles, and outside of them."""
-    of_kind = {
-        kind: interval(_per_seed([row for row in angles if row["kind"] == kind]))[0]
+    seeds = sorted({row["seed"] for row in angles})
+    nll = {
+        kind: interval([_mean_nll(angles, kind, seed) for seed in seeds])[0]
         for kind in ("trained", "between")
     }
-    steadily = [_steadiness(angles, seed) for seed in sorted({row["seed"] for row in angles})]
-    difference = of_kind["between"] - of_kind["trained"]
+    difference = nll["between"] - nll["trained"]
+    correlations = [_correlation_with_distance(angles, seed) for seed in seeds]
     return [
         Verdict(
             "between training angles within 0.05 nats of training angles",
@@ -129,8 +126,8 @@ def angle(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> 
         ),
         Verdict(
             "worsens steadily over the first radian outside: rank correlation with distance > 0.8",
-            f"{interval(steadily)[0]:.2f}, worst seed {min(steadily):.2f}",
-            interval(steadily)[0] > 0.8,
+            f"{interval(correlations)[0]:.2f}, worst seed {min(correlations):.2f}",
+            interval(correlations)[0] > 0.8,
         ),
     ]
 
@@ -146,23 +143,17 @@ def by_model(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return groups
 
 
-def _per_seed(rows: Sequence[Row]) -> list[float]:
-    seeds = sorted({row["seed"] for row in rows})
-    return [float(np.mean([row["nll"] for row in rows if row["seed"] == s])) for s in seeds]
+def _mean_nll(angles: Sequence[Row], kind: str, seed: int) -> float:
+    chosen = [row["nll"] for row in angles if (row["kind"], row["seed"]) == (kind, seed)]
+    return float(np.mean(chosen))
 
 
-def _steadiness(angles: Sequence[Row], seed: int) -> float:
-    """Rank-correlate likelihood and distance over the first radian beyond, mean of both sides."""
-    beyond = {
-        "after the last": lambda angle: angle - TRAINING_ANGLES[-1],
-        "before the first": lambda angle: 2 * np.pi - angle,
-    }
-    found = []
-    for distance in beyond.values():
-        near = [
-            (distance(row["angle"]), row["nll"])
-            for row in angles
-            if row["seed"] == seed and row["kind"] == "outside" and distance(row["angle"]) < 1
-        ]
-        found.append(float(spearmanr(*zip(*near, strict=True)).statistic))
-    return float(np.mean(found))
+def _correlation_with_distance(angles: Sequence[Row], seed: int) -> float:
+    """Rank correlation of NLL and distance over the first radian outside, mean of both sides."""
+    outside = [row for row in angles if (row["kind"], row["seed"]) == ("outside", seed)]
+    correlations = []
+    for distance in (lambda angle: angle - TRAINING_ANGLES[-1], lambda angle: 2 * np.pi - angle):
+        near = [(distance(row["angle"]), row["nll"]) for row in outside]
+        near = [pair for pair in near if pair[0] < 1]
+        correlations.append(float(spearmanr(*zip(*near, strict=True)).statistic))
+    return float(np.mean(correlations))

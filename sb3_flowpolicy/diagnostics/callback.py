@@ -1,4 +1,4 @@
-"""A callback that shows on TensorBoard what the policy's distribution looks like."""
+"""A callback that logs the policy's action distribution to TensorBoard."""
 
 from __future__ import annotations
 
@@ -15,20 +15,41 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_flowpolicy.diagnostics.figures import correlation_figure, samples_figure
-from sb3_flowpolicy.diagnostics.layout import DASHBOARD
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.policies.deterministic import critic_values
 
-# Pictures belong on TensorBoard; the text formats of SB3's logger refuse them.
+DASHBOARD: dict[str, dict[str, list]] = {
+    "Learning": {
+        "return (training: with exploration, test: deterministic)": [
+            "Multiline",
+            ["rollout/ep_rew_mean", "eval/mean_reward"],
+        ],
+        "success rate": ["Multiline", ["rollout/success_rate", "eval/success_rate"]],
+    },
+    "Exploration": {
+        "entropy (nats)": ["Multiline", ["policy/entropy"]],
+        "entropy coefficient": ["Multiline", ["train/ent_coef"]],
+        "standard deviation of each action": ["Multiline", [r"policy/scale_\d+"]],
+        "mean absolute correlation of actions": ["Multiline", ["policy/mean_abs_correlation"]],
+    },
+    "Stability": {
+        "Q": ["Multiline", ["value/q_policy", "value/q_buffer"]],
+        "losses": ["Multiline", ["train/critic_loss", "train/actor_loss"]],
+        "steps per second": ["Multiline", ["time/fps"]],
+    },
+}
+"""Category -> chart -> [kind, tags] of TensorBoard's custom-scalars page."""
+
+# SB3's text formats reject figures.
 _TEXT_FORMATS = ("stdout", "log", "json", "csv")
 
 
 class PolicyDiagnosticsCallback(BaseCallback):
-    r"""Log entropy, spread, correlation and value of the policy, as numbers and as pictures.
+    r"""Log entropy, standard deviation, correlation and value of the policy's actions.
 
-    Measured at states of the replay buffer, with random numbers of its own: a run with the
-    callback and one without are the same run. Training return and success rate come from SB3's
-    logger, test return from ``EvalCallback`` (rl_zoo3 adds one); the dashboard arranges them all.
+    Measured at states of the replay buffer. The callback does not consume the run's random
+    numbers, so a run is the same with and without it. Its dashboard on TensorBoard's custom-scalars
+    page also shows the return and success rate that SB3 and ``EvalCallback`` log.
 
     ====================================  ======================================================
     key                                   meaning
@@ -45,11 +66,11 @@ class PolicyDiagnosticsCallback(BaseCallback):
     Args:
         log_freq: Environment steps between two measurements, at least 1.
         image_freq: Environment steps between two sets of pictures; 0 draws none.
-        n_states: Number of states to measure at, at least 1.
+        n_states: Number of states, at least 1.
         n_samples: Number of actions per state, at least 2.
 
     Raises:
-        ValueError: If an argument is out of range, or the model's actor is not ours.
+        ValueError: If an argument is out of range, or the policy is not one of this package.
 
     Example:
         >>> from sb3_flowpolicy import SACFlow
@@ -68,10 +89,12 @@ class PolicyDiagnosticsCallback(BaseCallback):
         n_samples: int = 64,
     ) -> None:
         super().__init__()
-        self.log_freq = _at_least("log_freq", log_freq, 1)
-        self.image_freq = _at_least("image_freq", image_freq, 0)
-        self.n_states = _at_least("n_states", n_states, 1)
-        self.n_samples = _at_least("n_samples", n_samples, 2)
+        self.log_freq, self.image_freq = log_freq, image_freq
+        self.n_states, self.n_samples = n_states, n_samples
+        for name, least in {"log_freq": 1, "image_freq": 0, "n_states": 1, "n_samples": 2}.items():
+            value = getattr(self, name)
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
 
     def _on_training_start(self) -> None:
         actor = getattr(self.model, "actor", None)  # on-policy algorithms have none
@@ -97,7 +120,7 @@ class PolicyDiagnosticsCallback(BaseCallback):
         return True
 
     def _due(self, freq: int) -> bool:
-        """Whether the step just taken crossed a multiple of ``freq``, with any number of envs."""
+        """Whether the last step, of any number of environments, crossed a multiple of ``freq``."""
         return self.num_timesteps % freq < self.training_env.num_envs
 
     def _measure(self, obs: PyTorchObs, buffer_actions: th.Tensor, draw: bool) -> None:
@@ -132,7 +155,7 @@ class PolicyDiagnosticsCallback(BaseCallback):
 
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
-        """Leave the global generators as they were: looking must not change the run."""
+        """Restore the global generators, so that measuring does not change the run."""
         state = np.random.get_state()  # noqa: NPY002 (SB3's buffers draw from the global state)
         with th.random.fork_rng(
             devices=[self.model.device] if self.model.device.type == "cuda" else []
@@ -141,9 +164,3 @@ class PolicyDiagnosticsCallback(BaseCallback):
                 yield
             finally:
                 np.random.set_state(state)  # noqa: NPY002
-
-
-def _at_least(name: str, value: int, least: int) -> int:
-    if value < least:
-        raise ValueError(f"{name} must be at least {least}, got {value}")
-    return value

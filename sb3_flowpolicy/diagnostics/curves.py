@@ -1,4 +1,4 @@
-"""`python -m sb3_flowpolicy.diagnostics.curves`: draw the test returns that train_seeds wrote."""
+"""`python -m sb3_flowpolicy.diagnostics.curves`: draw test returns written by train_seeds."""
 
 from __future__ import annotations
 
@@ -18,14 +18,7 @@ HEADER = "seed,step,test_return,std"
 
 
 def read_evaluations(path: str | Path) -> np.ndarray:
-    """Read an ``evaluations.csv``: rows of seed, step, mean and spread of the test return.
-
-    Returns:
-        Array of shape (rows, 4).
-
-    Raises:
-        ValueError: If the file is not of this kind.
-    """
+    """Read an ``evaluations.csv`` as an array (rows, 4) of the columns of ``HEADER``."""
     header, *rows = Path(path).read_text().splitlines()
     if header != HEADER or not rows:
         raise ValueError(f"evaluations must start with {HEADER!r} and have rows, got {path}")
@@ -33,13 +26,10 @@ def read_evaluations(path: str | Path) -> np.ndarray:
 
 
 def curves_figure(evaluations: Mapping[str, np.ndarray]) -> Figure:
-    """Draw a thin line for each seed and a thick one for their mean.
+    """Draw each seed as a thin line and the mean over seeds as a thick one.
 
     Args:
-        evaluations: Name of the agent -> what :func:`read_evaluations` returns.
-
-    Returns:
-        A matplotlib figure.
+        evaluations: Name of the agent -> its array of :func:`read_evaluations`.
 
     Example:
         >>> rows = np.array([[1, 100, 2.0, 0.1], [1, 200, 3.0, 0.1]])
@@ -62,10 +52,10 @@ def curves_figure(evaluations: Mapping[str, np.ndarray]) -> Figure:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Draw what the command line names."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.diagnostics.curves",
-        description="Draw the test returns of files that train_seeds --eval-freq wrote.",
+        description="Draw the test returns in files written by train_seeds --eval-freq.",
     )
     parser.add_argument("files", nargs="+", metavar="name=file.csv", help="agents and their files")
     parser.add_argument("-o", "--output", type=Path, required=True, help="picture to write")

@@ -7,17 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
 
 POLICY_BLUE = "#1f6fb4"
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return a figure that belongs to no window and no pyplot state.
-
-    Raises:
-        ModuleNotFoundError: If matplotlib is missing, with what to install.
-    """
+    """Return a figure without a window and without pyplot's global state."""
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
@@ -25,6 +23,21 @@ def new_figure(width: float, height: float) -> Figure:
             'pictures need matplotlib: pip install "sb3_flowpolicy[zoo]"'
         ) from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def draw_seeds(axes: Axes, steps: ArrayLike, values: ArrayLike, color: str, label: str) -> None:
+    """Draw each seed as a thin line and the mean over seeds as a thick one.
+
+    Args:
+        axes: Where to draw.
+        steps: Shape (T,).
+        values: Shape (S, T).
+        color: Color of all lines.
+        label: Name of the mean in the legend.
+    """
+    values = np.asarray(values)
+    axes.plot(steps, values.T, color=color, linewidth=0.8, alpha=0.4)
+    axes.plot(steps, values.mean(0), color=color, linewidth=2.2, label=label)
 
 
 def correlation_figure(correlation: np.ndarray) -> Figure:
@@ -51,8 +64,8 @@ def correlation_figure(correlation: np.ndarray) -> Figure:
     if len(correlation) <= 8:
         for i, j in np.ndindex(correlation.shape):
             value = abs(correlation[i, j])
-            colour = "black" if value > 0.6 else "white"
-            axes.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=8)
+            color = "black" if value > 0.6 else "white"
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", color=color, fontsize=8)
     figure.colorbar(image, label="|correlation|")
     return figure
 
@@ -74,7 +87,7 @@ def samples_figure(samples: np.ndarray) -> Figure:
     n_columns = min(2, len(samples))
     n_rows = -(-len(samples) // n_columns)
     figure = new_figure(2.2 * n_columns, 2.2 * n_rows)
-    # Samples hug the edge of the box when the policy saturates: leave room to see them.
+    # Leave room around the box, on whose edge the samples of a saturated policy lie.
     limits = (-1.1, 1.1)
     for panel, points in enumerate(samples):
         axes = figure.add_subplot(n_rows, n_columns, panel + 1)

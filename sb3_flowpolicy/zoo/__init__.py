@@ -1,15 +1,10 @@
 """Plug-in for rl_zoo3: algorithms, environments, hyperparameter files and Optuna samplers.
 
-Once the package is installed, `python -m rl_zoo3.train --algo sac_flow …` needs nothing more: the
-start-up hook calls `plug_in` for us. Without the hook, `python -m sb3_flowpolicy.zoo.train …` or,
-in a program, `register` do the same.
+`python -m rl_zoo3.train --algo sac_flow …` works once the package is installed, because the
+start-up hook calls `plug_in`. Without the hook, use `python -m sb3_flowpolicy.zoo.train …` or, in a
+program, `register`.
 """
 
-from sb3_flowpolicy.zoo.registration import (
-    ALGORITHMS,
-    hyperparameter_file,
-    plug_in,
-    register,
-)
+from sb3_flowpolicy.zoo.registration import ALGORITHMS, hyperparameter_file, plug_in, register
 
 __all__ = ["ALGORITHMS", "hyperparameter_file", "plug_in", "register"]

@@ -1,7 +1,4 @@
-"""`python -m sb3_flowpolicy.zoo.evaluate`: success rate and picture of a model trained by the zoo.
-
-Reads what `python -m rl_zoo3.train` wrote, with the same options to name a run.
-"""
+"""`python -m sb3_flowpolicy.zoo.evaluate`: success rate and picture of a trained model."""
 
 import argparse
 from pathlib import Path
@@ -11,30 +8,19 @@ from sb3_flowpolicy.zoo.saved_run import add_run_arguments, load_run
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Evaluate the model that the command line names, print, and write the picture.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-
-    Raises:
-        ValueError: If there is no such model.
-    """
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.zoo.evaluate",
         description="Print the success rate of a trained model and draw its policy.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add_run_arguments(parser)
-    parser.add_argument(
-        "-n", "--n-episodes", type=int, default=100, help="episodes per success rate"
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, help="picture (default: policy.png in the run)"
-    )
+    add = parser.add_argument
+    add("-n", "--n-episodes", type=int, default=100, help="episodes per success rate")
+    add("-o", "--output", type=Path, help="picture (default: policy.png next to the model)")
     args = parser.parse_args(arguments)
 
     model, env, path = load_run(args)
-
     print(f"{args.algo} on {args.env}, {args.n_episodes} episodes each ({path}):")
     for name, deterministic in {"deterministic": True, "stochastic": False}.items():
         success, mean_return = evaluate_success(model, env, args.n_episodes, deterministic)

@@ -1,24 +1,17 @@
-"""`python -m sb3_flowpolicy.zoo.film`: a video and a sequence of pictures of a trained model."""
+"""`python -m sb3_flowpolicy.zoo.film`: video and picture sequence of a trained model."""
 
 import argparse
 from pathlib import Path
 
-from sb3_flowpolicy.diagnostics.film import episode_frames, sequence_figure, write_video
+from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
 from sb3_flowpolicy.zoo.saved_run import add_run_arguments, load_run
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Film the model that the command line names.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-
-    Raises:
-        ValueError: If there is no such model, or the sequence lies beyond the episode's end.
-    """
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.zoo.film",
-        description="Write an MP4 of a trained model, its action samples drawn as dots, and "
+        description="Write an MP4 of a trained model with its action samples drawn as dots, and "
         "optionally a picture of consecutive steps. Works for all environments of this package.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )

@@ -1,4 +1,4 @@
-"""Runs rl_zoo3's scripts with our algorithms, without relying on the start-up hook."""
+"""Runs rl_zoo3's scripts with our algorithms, without the start-up hook."""
 
 import runpy
 from importlib.util import find_spec
@@ -9,14 +9,7 @@ INSTALL_HINT = 'rl_zoo3 is not installed. Install it with: pip install "sb3_flow
 
 
 def run(script: str) -> None:
-    """Run `python -m rl_zoo3.<script>` in this process, with this process's arguments.
-
-    Args:
-        script: Name of a module of rl_zoo3 that can be run, such as `"train"`.
-
-    Raises:
-        SystemExit: If rl_zoo3 is not installed; says how to install it.
-    """
+    """Run `python -m rl_zoo3.<script>` in this process, with this process's arguments."""
     if find_spec("rl_zoo3") is None:
         raise SystemExit(INSTALL_HINT)
     register()

@@ -1,4 +1,4 @@
-"""What rl_zoo3 has to know about us, module by module."""
+"""Registration of our algorithms with rl_zoo3, module by module."""
 
 import functools
 import importlib
@@ -9,13 +9,13 @@ from types import ModuleType
 from typing import Any
 
 _CLASSES = {
-    "sac_flow": ("sac_flow", "SACFlow"),
-    "sac_lowrank": ("sac_flow", "SACFlow"),
-    "sac_gauss": ("sac_flow", "SACFlow"),
-    "tqc_flow": ("contrib", "TQCFlow"),
-    "crossq_flow": ("contrib", "CrossQFlow"),
-    "ppo_flow": ("ppo_flow", "PPOFlow"),
-    "ppo_lowrank": ("ppo_flow", "PPOFlow"),
+    "sac_flow": "SACFlow",
+    "sac_lowrank": "SACFlow",
+    "sac_gauss": "SACFlow",
+    "tqc_flow": "TQCFlow",
+    "crossq_flow": "CrossQFlow",
+    "ppo_flow": "PPOFlow",
+    "ppo_lowrank": "PPOFlow",
 }
 ALGORITHMS = tuple(_CLASSES)
 """Names for `--algo`. Each has a hyperparameter file, which names the policy."""
@@ -24,13 +24,10 @@ _MARK = "_knows_sb3_flowpolicy"
 
 
 def hyperparameter_file(algorithm: str) -> Path:
-    """Path of the YAML file that rl_zoo3 reads when no `-conf` is given.
+    """Return the path of the YAML file that rl_zoo3 reads without `-conf`.
 
     Args:
         algorithm: One of `ALGORITHMS`.
-
-    Raises:
-        ValueError: If the algorithm is not ours.
 
     Example:
         >>> hyperparameter_file("sac_flow").name
@@ -43,12 +40,9 @@ def hyperparameter_file(algorithm: str) -> Path:
 
 
 def register() -> None:
-    """Make rl_zoo3 know our algorithms, environments, files and samplers, in this process.
+    """Register algorithms, environments, files and samplers with rl_zoo3 in this process.
 
-    May be called any number of times, and after rl_zoo3 was imported.
-
-    Raises:
-        ModuleNotFoundError: If rl_zoo3 is not installed.
+    May be called repeatedly, and after rl_zoo3 was imported.
 
     Example:
         >>> register()
@@ -61,11 +55,7 @@ def register() -> None:
 
 
 def plug_in(module: ModuleType) -> None:
-    """Extend one module of rl_zoo3 in place; any other module is left alone.
-
-    Args:
-        module: A module that has run completely, such as `rl_zoo3.utils`.
-    """
+    """Extend one fully imported module of rl_zoo3 in place; ignore any other module."""
     plug = _PLUGS.get(module.__name__)
     if plug is not None:
         plug(module)
@@ -74,9 +64,8 @@ def plug_in(module: ModuleType) -> None:
 def _plug_into_utils(module: ModuleType) -> None:
     import flowpolicy_envs  # noqa: F401, registers the environments
 
-    for name, (where, class_name) in _CLASSES.items():
-        algorithm = getattr(importlib.import_module(f"sb3_flowpolicy.{where}"), class_name)
-        module.ALGOS[name] = algorithm
+    package = importlib.import_module("sb3_flowpolicy")
+    module.ALGOS.update({name: getattr(package, kind) for name, kind in _CLASSES.items()})
 
 
 def _plug_into_hyperparams_opt(module: ModuleType) -> None:
@@ -94,7 +83,7 @@ def _plug_into_exp_manager(module: ModuleType) -> None:
 
 
 def _with_our_files(init: Callable[..., None]) -> Callable[..., None]:
-    """Wrap `ExperimentManager.__init__`: rl_zoo3 looks for default files in its own folder only."""
+    """Wrap `ExperimentManager.__init__`, which looks for default files in rl_zoo3 only."""
     signature = inspect.signature(init)
 
     @functools.wraps(init)

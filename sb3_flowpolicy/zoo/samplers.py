@@ -1,8 +1,8 @@
 """Optuna search spaces: rl_zoo3's for SAC, TQC and PPO, plus the shape of the action distribution.
 
-rl_zoo3 lets the sampled `policy_kwargs` replace those of the YAML file. Ours are laid over them,
-so that weight decay and the like stay as configured. For `--trial-id`, rl_zoo3 hands the converter
-nothing but the parameters of the trial; what was kept is therefore stored as one of them.
+rl_zoo3 replaces the `policy_kwargs` of the YAML file by the sampled ones. Ours are merged into
+them, so that weight decay, for example, stays as configured. For `--trial-id`, rl_zoo3 passes only
+the parameters of the trial to the converter; the configured values are therefore stored as one.
 """
 
 import ast
@@ -18,21 +18,18 @@ if TYPE_CHECKING:
 Sampler = Callable[["optuna.Trial", int, int, dict[str, Any]], dict[str, Any]]
 
 FLOW_HIDDEN = {"small": [10, 10], "medium": [32, 32]}
-"""Units of a coupling layer's conditioner. Small is the thesis's."""
+"""Units of a coupling layer's conditioner; the thesis uses "small"."""
 
 _KEPT = "kept_policy_kwargs"
 _TUNED = ("layers", "hidden", "rank")
 
 
 def convert(params: dict[str, Any], off_policy: bool = True) -> dict[str, Any]:
-    """Turn the parameters of a trial into arguments of the algorithm.
+    """Turn the parameters of a trial into keyword arguments of the algorithm.
 
     Args:
         params: `trial.params` of a trial that one of `SAMPLERS` filled.
         off_policy: False for PPO.
-
-    Returns:
-        Keyword arguments, `policy_kwargs` complete.
 
     Example:
         >>> params = dict(one_minus_gamma=0.02, net_arch="small", rank=3)
@@ -47,7 +44,7 @@ def convert(params: dict[str, Any], off_policy: bool = True) -> dict[str, Any]:
 
 
 def _sampler(suggest: Callable[["optuna.Trial", int], None], algorithm: str = "sac") -> Sampler:
-    """Build a sampler out of what it suggests in addition to rl_zoo3's sampler."""
+    """Extend rl_zoo3's sampler of an algorithm by `suggest`."""
 
     def sample(
         trial: "optuna.Trial", n_actions: int, n_envs: int, additional_args: dict[str, Any]
@@ -73,12 +70,8 @@ def _suggest_lowrank(trial: "optuna.Trial", n_actions: int) -> None:
     trial.suggest_int("rank", 1, min(4, n_actions))
 
 
-def _suggest_nothing(trial: "optuna.Trial", n_actions: int) -> None:
-    pass
-
-
 def _complete(hyperparams: dict[str, Any], params: dict[str, Any]) -> dict[str, Any]:
-    """Lay the sampled `policy_kwargs` and distribution over the configured ones."""
+    """Merge the sampled `policy_kwargs` and distribution into the configured ones."""
     kept = json.loads(params.get(_KEPT, "{}"))
     tuned = {name: params[name] for name in _TUNED if name in params}
     if "hidden" in tuned:
@@ -90,14 +83,14 @@ def _complete(hyperparams: dict[str, Any], params: dict[str, Any]) -> dict[str, 
 
 
 def _configured_policy_kwargs(trial: "optuna.Trial") -> dict[str, Any]:
-    """Read the YAML file's `policy_kwargs`, which rl_zoo3 writes down in the study as text."""
+    """Read the YAML file's `policy_kwargs`, which rl_zoo3 stores in the study as text."""
     text = trial.study.user_attrs.get("policy_kwargs", "{}")
     try:
         return ast.literal_eval(text)
     except (SyntaxError, ValueError):
         warnings.warn(
             f"policy_kwargs must be plain numbers, strings and lists to be kept while "
-            f"tuning, got {text}: using the sampled ones alone",
+            f"tuning, got {text}: only the sampled ones are used",
             stacklevel=2,
         )
         return {}
@@ -106,7 +99,7 @@ def _configured_policy_kwargs(trial: "optuna.Trial") -> dict[str, Any]:
 SAMPLERS: dict[str, Sampler] = {
     "sac_flow": _sampler(_suggest_flow),
     "sac_lowrank": _sampler(_suggest_lowrank),
-    "sac_gauss": _sampler(_suggest_nothing),
+    "sac_gauss": _sampler(lambda trial, n_actions: None),
     "tqc_flow": _sampler(_suggest_flow, "tqc"),
     "ppo_flow": _sampler(_suggest_flow, "ppo"),
     "ppo_lowrank": _sampler(_suggest_lowrank, "ppo"),
@@ -119,5 +112,5 @@ CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def refuse(*_: Any) -> dict[str, Any]:
-    """Raise `ValueError`: rl_zoo3 has no search space for CrossQ, and neither have we."""
+    """Raise `ValueError`: there is no search space for CrossQ."""
     raise ValueError(f"--algo must be one of {list(CONVERTERS)} to --optimize, got 'crossq_flow'")

@@ -1,4 +1,4 @@
-"""Models that `rl_zoo3.train` or `train_seeds` left behind, with their environments."""
+"""Load models that `rl_zoo3.train` or `train_seeds` saved, with their environments."""
 
 import argparse
 from pathlib import Path
@@ -10,7 +10,7 @@ from sb3_flowpolicy.zoo.registration import ALGORITHMS, register
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name a run, as `rl_zoo3.enjoy` calls them."""
+    """Add the options that select a run, named as in `rl_zoo3.enjoy`."""
     add = parser.add_argument
     add("--algo", default="sac_flow", choices=ALGORITHMS, help="algorithm")
     add("--env", default="TunnelDiagonal-v0", help="environment id")
@@ -22,10 +22,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def load_run(args: argparse.Namespace) -> tuple[BaseAlgorithm, VecEnv, Path]:
-    """Load what the options of `add_run_arguments` name.
+    """Load the run that the options of `add_run_arguments` select.
 
     Returns:
-        The model, one environment of its kind that draws `rgb_array`, and the model's file.
+        The model, one environment that renders `rgb_array`, and the model's file.
 
     Raises:
         ValueError: If there is no such model.

@@ -1,4 +1,4 @@
-"""Every new policy class is trained beside the stock one, and nothing twice."""
+"""Every policy class is trained beside the stock one, and no run twice."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_runs_are_written_down_and_not_repeated(
+def test_runs_are_recorded_and_not_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "table.csv"

@@ -1,4 +1,4 @@
-"""No NaN, whatever the data: every density, every case."""
+"""Every density stays finite in every case."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def test_stays_finite_for_long(distribution: str, name: str) -> None:
 
 
 class Careless(DiagGaussian):
-    """Divides by a standard deviation that it does not keep away from zero."""
+    """Divides by a standard deviation that may be zero."""
 
     def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         return self.mu(context), self.log_std(context) * 1e3
 
 
-def test_a_careless_density_is_found_out(
+def test_a_careless_density_is_detected(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(registry, "_REGISTRY", {"careless": Careless})

@@ -12,10 +12,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks import environments, flows, learning, trust, updates
-from sb3_flowpolicy.benchmarks.limit import products_alone
+from sb3_flowpolicy.benchmarks.learning import stock_block, zoo_block
 from sb3_flowpolicy.benchmarks.report import Row
 from sb3_flowpolicy.benchmarks.throughput import GROUPS, main
-from sb3_flowpolicy.benchmarks.zoo_blocks import stock_block, zoo_block
+from sb3_flowpolicy.benchmarks.updates import products_alone
 
 MODULES = (updates, learning, environments, trust, flows)
 
@@ -88,11 +88,11 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__.split(".")[-1])
 @pytest.mark.parametrize("quick", [True, False])
-def test_contests_are_well_formed(module: object, quick: bool) -> None:
-    for contest in module.contests(quick):  # type: ignore[attr-defined]
-        names = [entrant.name for entrant in contest.entrants]
+def test_benchmarks_are_well_formed(module: object, quick: bool) -> None:
+    for benchmark in module.benchmarks(quick):  # type: ignore[attr-defined]
+        names = [candidate.name for candidate in benchmark.candidates]
         assert len(set(names)) == len(names)
-        assert {entrant.limit for entrant in contest.entrants} <= {None, *names}
+        assert {candidate.limit for candidate in benchmark.candidates} <= {None, *names}
 
 
 @pytest.mark.parametrize("algorithm", ["sac_flow", "sac_lowrank", "sac_gauss"])
@@ -139,14 +139,14 @@ def test_limit_does_the_products_of_an_update(policy: str, n_seeds: int) -> None
     batches = engine.draw(1, 64)
     whole = multiplications(lambda: engine.train(batches))
     assert work() == n_seeds
-    # Not counted: that the first coupling needs no gradient with respect to the noise.
+    # The limit ignores that the first coupling needs no gradient with respect to the noise.
     assert alone == pytest.approx(whole, rel=1e-3)
 
 
 def test_zuko_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zuko", None)
     with pytest.raises(updates.UnavailableError, match="zuko is not installed"):
-        flows.contests()[0].entrants[0].prepare()
+        flows.benchmarks()[0].candidates[0].prepare()
 
 
 def test_a_run_leaves_the_number_of_threads_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,11 +4,18 @@ from collections.abc import Callable
 
 import pytest
 
-from sb3_flowpolicy.benchmarks.timing import Contest, Entrant, Timing, UnavailableError, Work, race
+from sb3_flowpolicy.benchmarks.timing import (
+    Benchmark,
+    Candidate,
+    Timing,
+    UnavailableError,
+    Work,
+    measure,
+)
 
 
 class FakeClock:
-    """A clock that stands still but for the work that moves it, and remembers who worked."""
+    """A clock that only work advances, with a log of the candidates that worked."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -17,7 +24,7 @@ class FakeClock:
     def __call__(self) -> float:
         return self.now
 
-    def entrant(self, name: str, durations: Callable[[int], float]) -> Entrant:
+    def candidate(self, name: str, durations: Callable[[int], float]) -> Candidate:
         """One unit of work per call; ``durations`` maps the number of the call to seconds."""
 
         def prepare() -> Work:
@@ -31,61 +38,63 @@ class FakeClock:
 
             return work
 
-        return Entrant(name, prepare)
+        return Candidate(name, prepare)
 
 
-def contest(*entrants: Entrant) -> Contest:
-    return Contest("title", "units", entrants)
+def benchmark(*candidates: Candidate) -> Benchmark:
+    return Benchmark("title", "units", candidates)
 
 
-def test_entrants_take_turns() -> None:
+def test_candidates_take_turns() -> None:
     clock = FakeClock()
-    entrants = [clock.entrant(name, lambda _: 1.0) for name in "ABC"]
-    race(contest(*entrants), rounds=5, turn_seconds=0.5, clock=clock)
+    candidates = [clock.candidate(name, lambda _: 1.0) for name in "ABC"]
+    measure(benchmark(*candidates), rounds=5, turn_seconds=0.5, clock=clock)
     assert "".join(clock.log) == "ABC" * 6  # the first is warm-up
 
 
 def test_a_turn_repeats_its_work_until_its_time_has_passed() -> None:
     clock = FakeClock()
-    (timing,) = race(contest(clock.entrant("A", lambda _: 1.0)), turn_seconds=2.5, clock=clock)
+    (timing,) = measure(
+        benchmark(clock.candidate("A", lambda _: 1.0)), turn_seconds=2.5, clock=clock
+    )
     assert len(clock.log) == 1 + 5 * 3
     assert timing.rates == [1.0] * 5
 
 
-def test_warm_up_is_apart_and_the_median_ignores_a_hiccup() -> None:
+def test_warm_up_is_separate_and_the_median_ignores_an_outlier() -> None:
     clock = FakeClock()
-    slow_once = clock.entrant("A", lambda call: {0: 100.0, 2: 50.0}.get(call, 0.5))
-    (timing,) = race(contest(slow_once), turn_seconds=0.1, clock=clock)
+    slow_once = clock.candidate("A", lambda call: {0: 100.0, 2: 50.0}.get(call, 0.5))
+    (timing,) = measure(benchmark(slow_once), turn_seconds=0.1, clock=clock)
     assert timing.warm_up_seconds == 110
     assert timing.rates == [2, 1 / 50, 2, 2, 2]
     assert timing.median == 2
 
 
 def test_ratio_is_taken_within_rounds() -> None:
-    # Load doubles from round to round: the rates wander, their ratio does not.
-    peer = Timing("peer", rates=[16, 8, 4, 2, 1])
+    # Load doubles from round to round: the rates change, their ratio does not.
+    baseline = Timing("baseline", rates=[16, 8, 4, 2, 1])
     ours = Timing("ours", rates=[48, 24, 12, 6, 3])
-    assert ours.ratio_to(peer) == 3
+    assert ours.ratio_to(baseline) == 3
     assert ours.ratio_to(Timing("absent")) is None
-    assert Timing("absent").ratio_to(peer) is None
+    assert Timing("absent").ratio_to(baseline) is None
 
 
-def test_who_is_unavailable_leaves_a_note() -> None:
+def test_an_unavailable_candidate_leaves_a_note() -> None:
     def prepare() -> Work:
         raise UnavailableError("not installed")
 
     clock = FakeClock()
-    entrants = [Entrant("absent", prepare), clock.entrant("A", lambda _: 1.0)]
-    absent, present = race(contest(*entrants), turn_seconds=0.5, clock=clock)
+    candidates = [Candidate("absent", prepare), clock.candidate("A", lambda _: 1.0)]
+    absent, present = measure(benchmark(*candidates), turn_seconds=0.5, clock=clock)
     assert (absent.rates, absent.median, absent.note) == ([], None, "not installed")
     assert present.median == 1
 
 
 def test_progress_reaches_the_end() -> None:
     clock, seen = FakeClock(), []
-    entrants = [clock.entrant(name, lambda _: 1.0) for name in "AB"]
-    race(
-        contest(*entrants),
+    candidates = [clock.candidate(name, lambda _: 1.0) for name in "AB"]
+    measure(
+        benchmark(*candidates),
         turn_seconds=0.5,
         clock=clock,
         progress=lambda name, done, total: seen.append((name, done, total)),
@@ -105,4 +114,4 @@ def test_progress_reaches_the_end() -> None:
 )
 def test_bad_arguments(arguments: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        race(contest(), **arguments)
+        measure(benchmark(), **arguments)

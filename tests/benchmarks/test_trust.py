@@ -1,4 +1,4 @@
-"""What measures the guard measures it."""
+"""The measurement of the guard's cost, and the run on the Ant."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sb3_flowpolicy.benchmarks import trust
 
 def test_every_call_of_the_guard_is_timed() -> None:
     turns = trust._Turns("SACFlow", quick=True)
-    turns.watched()
+    turns.guarded()
     times = trust._time_calls(turns)
     counts = {name: len(values) for name, values in times.items()}
     chunk = trust.QUICK_CHUNK
@@ -24,14 +24,13 @@ def test_every_call_of_the_guard_is_timed() -> None:
     }
 
 
-def test_a_blind_turn_looks_at_nothing() -> None:
-    """Otherwise the two turns would be the same, and the guard free."""
+def test_an_unguarded_turn_checks_nothing() -> None:
     turns = trust._Turns("SACFlow", quick=True)
-    turns.unwatched()
+    turns.unguarded()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trust.TrainingGuard, "look", lambda _: pytest.fail("looked"))
-        assert turns.unwatched() == trust.QUICK_CHUNK
-    assert turns.watched() == trust.QUICK_CHUNK
+        assert turns.unguarded() == trust.QUICK_CHUNK
+    assert turns.guarded() == trust.QUICK_CHUNK
 
 
 def test_ant_table(
@@ -42,7 +41,7 @@ def test_ant_table(
 
     small = {"learning_starts": 40, "compile": False, "policy_kwargs": {"net_arch": [8]}}
     monkeypatch.setattr(ant, "SETTINGS", {**ant.SETTINGS, **small, "buffer_size": 200})
-    monkeypatch.setattr(ant, "STEPS_BETWEEN_LOOKS", 50)
+    monkeypatch.setattr(ant, "STEPS_PER_ROW", 50)
     path = tmp_path / "ant.csv"
     with pytest.raises(SystemExit, match="0"):
         ant.main(["--seeds", "3", "4", "--steps", "100", "--csv", str(path)])

@@ -1,4 +1,4 @@
-"""The command from end to end in its quick form, its files, its report, and its errors."""
+"""The quick form of the command, its files, its report and its errors."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from PIL import Image
 
 from sb3_flowpolicy.density.__main__ import main
 from sb3_flowpolicy.density.report import PICTURES
-from sb3_flowpolicy.density.results import interval, read_csv, write_csv
+from sb3_flowpolicy.density.results import read_csv, write_csv
 from sb3_flowpolicy.density.studies import FULL, STUDIES, Study, angles_to_score
-from sb3_flowpolicy.density.verdicts import angle, label, sound, two_moons
+from sb3_flowpolicy.density.verdicts import angle, interval, label, sound, two_moons
 
 Row = dict[str, object]
 
@@ -32,9 +32,9 @@ def test_quick_run_leaves_rows_for_every_model_and_seed(folder: Path, study: Stu
     ]
     for row in rows:
         assert row["nll"] > row["entropy"]
-        # The gap is the distance to the truth, measured on the same points.
+        # The gap is the distance to the true density on the same points.
         assert row["gap"] == pytest.approx(row["nll"] - row["entropy"], abs=6 * row["gap_se"])
-        # zuko's NAF is no density before it has trained for long.
+        # zuko's NAF loses mass before long training.
         if row["model"] != "naf":
             assert row["integral_low"] == pytest.approx(1, abs=0.02)
     curves = read_csv(folder / f"{study.name}-curves.csv")
@@ -66,7 +66,7 @@ def test_report_shows_every_study_and_check(
         assert study.thesis in text
         for picture in PICTURES[study.name]:
             assert f"({picture})" in text
-    # Two seeds that have hardly been trained cannot have reached what the thesis did.
+    # Two hardly trained seeds cannot satisfy all criteria.
     assert "| **no** |" in text
 
 

@@ -15,8 +15,9 @@ from sb3_flowpolicy.density.datasets import (
     Scaler,
     TwoMoons,
     angle_condition,
+    entropy_on_grid,
+    moon_log_density,
 )
-from sb3_flowpolicy.density.moons import entropy_on_grid, moon_log_density
 
 DATA_SETS = {"moons": TwoMoons(), "label": TwoMoons(labelled=True), "angle": AngleMoons()}
 
@@ -28,7 +29,7 @@ def test_two_moons_are_scikit_learns() -> None:
     np.testing.assert_array_equal(sample.condition[:, 0], label)
 
 
-def test_standardising_is_scikit_learns() -> None:
+def test_standardizing_is_scikit_learns() -> None:
     points = TwoMoons().draw(2000, seed=0).points
     scaler = StandardScaler().fit(points)
     ours = Scaler.of(points)
@@ -43,7 +44,7 @@ def test_angle_moons_are_the_thesiss() -> None:
     np.testing.assert_allclose(data.angles, np.linspace(0.0, 2.1, 22))
     _, counts = np.unique(sample.condition.round(6), axis=0, return_counts=True)
     assert counts.tolist() == [227] * 22
-    # Turned back, every point lies on the upper half circle, but for the noise.
+    # Turned back, every point lies on the upper half circle, except for the noise.
     angle = np.arctan2(sample.condition[:, 0], sample.condition[:, 1])
     direction = np.arctan2(sample.points[:, 1], sample.points[:, 0]) - angle
     radius = np.linalg.norm(sample.points, axis=1)
@@ -98,7 +99,7 @@ def test_turning_points_and_angle_changes_nothing() -> None:
 
 
 def test_moon_density_converged_in_its_nodes() -> None:
-    """Against a sum over so many nodes that it cannot matter how they are placed."""
+    """Against a sum over many evenly spaced nodes."""
     points = np.random.default_rng(1).uniform(-1.3, 1.3, size=(40, 2))
     angle = (np.arange(20_000) + 0.5) * np.pi / 20_000
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)

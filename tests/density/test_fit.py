@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_flowpolicy.density.ensemble import Ensemble
-from sb3_flowpolicy.density.fit import Data, Recipe, fit, mean_nll
-from sb3_flowpolicy.density.integrate import density_picture, integral
+from sb3_flowpolicy.density.figures import density_picture
+from sb3_flowpolicy.density.fit import Data, Ensemble, Recipe, fit, mean_nll
+from sb3_flowpolicy.density.measure import integral
 from sb3_flowpolicy.density.models import (
     HIDDEN,
     LAYERS,
@@ -33,7 +33,7 @@ def shifted_normal(n: int, seed: int, condition_dim: int = 0) -> Data:
 
 
 def shake(model: FlowModel, scale: float = 0.2) -> FlowModel:
-    """Move all weights: an identity flow would prove nothing."""
+    """Change all weights, since an identity flow would pass any test."""
     generator = th.Generator().manual_seed(1)
     with th.no_grad():
         for parameter in model.parameters():
@@ -65,13 +65,13 @@ def test_fits_improve(name: str) -> None:
     curves = fit(ensemble, train, validation, Recipe(epochs=6, check_every=2))
     after = mean_nll(ensemble, validation)
     assert (after < before).all()
-    # What is kept is what validated best.
+    # The weights with the best validation are kept.
     th.testing.assert_close(after, curves.validation.min(0).values)
     assert curves.epoch.tolist() == [2, 4, 6]
 
 
-def test_a_seed_does_not_feel_the_others() -> None:
-    """With the same order of points, clipping and averaging are each seed's own business."""
+def test_seeds_are_independent() -> None:
+    """With the same order of points, clipping and averaging act on each seed separately."""
     train, validation = shifted_normal(50, 0), shifted_normal(50, 1)
     wild = Data(train.points.clone(), train.condition)
     wild.points[1:] *= 100
@@ -84,7 +84,7 @@ def test_a_seed_does_not_feel_the_others() -> None:
     assert not th.isclose(nll[0][1], nll[1][1])
 
 
-def test_fitting_repeats_itself() -> None:
+def test_fitting_is_reproducible() -> None:
     weights = []
     for _ in range(2):
         ensemble = Ensemble("realnvp", 0, SEEDS)
@@ -100,7 +100,7 @@ def test_densities_integrate_to_one(name: str) -> None:
     assert integral(model, th.tensor([0.3, -1.0]), cells=300) == pytest.approx(1, abs=0.01)
 
 
-def test_a_wrong_log_determinant_is_seen() -> None:
+def test_a_wrong_log_determinant_is_detected() -> None:
     class Wrong(FlowModel):
         def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
             return -0.5 * points.square().sum(-1) - math.log(2 * math.pi) + 0.1
@@ -112,7 +112,7 @@ def test_a_wrong_log_determinant_is_seen() -> None:
 
 
 def test_naf_loses_mass_before_training() -> None:
-    """Its layers do not reach the whole plane: why its integrals are reported."""
+    """Its layers do not reach the whole plane, which is why integrals are reported."""
     assert integral(make_model("naf", 0, seed=0).eval(), th.zeros(0), cells=100) < 0.5
 
 
@@ -138,7 +138,7 @@ def test_layers_end_at_the_sample(condition_dim: int) -> None:
     assert len(images) == LAYERS + 1
     assert th.equal(images[0], noise)
     th.testing.assert_close(images[-1], model.sample(noise, condition).detach())
-    # Every layer moves one coordinate, in turns.
+    # The layers move the two coordinates alternately.
     for layer, (before, after) in enumerate(pairwise(images)):
         assert th.equal(before[:, layer % 2], after[:, layer % 2])
         assert not th.equal(before[:, 1 - layer % 2], after[:, 1 - layer % 2])
@@ -146,7 +146,7 @@ def test_layers_end_at_the_sample(condition_dim: int) -> None:
 
 @pytest.mark.parametrize("name", ["zuko-realnvp", "maf", "nsf"])
 def test_samples_follow_the_density(name: str) -> None:
-    """What noise becomes, scored, is the noise's density over the volume change."""
+    """The density of a sample is that of its noise divided by the change of volume."""
     model = shake(make_model(name, 1, seed=0)).double()
     noise, condition = th.randn(4, 2, dtype=th.float64), th.rand(4, 1, dtype=th.float64)
     points = model.sample(noise, condition)
@@ -161,18 +161,15 @@ def test_samples_follow_the_density(name: str) -> None:
 
 
 def test_density_picture_has_y_upwards() -> None:
-    model = make_model("realnvp", 0, seed=0)
-    image = density_picture(model, th.zeros(0), extent=2.0, cells=4)
-    centre = np.array([-1.5, -0.5, 0.5, 1.5])
-    expected = np.exp(-0.5 * (centre[:, None] ** 2 + centre**2)) / (2 * np.pi)
+    class Shifted(FlowModel):
+        def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+            centered = points - th.tensor([0.0, 1.0])
+            return -0.5 * centered.square().sum(-1) - math.log(2 * math.pi)
+
+        def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+            return noise
+
+    image = density_picture(Shifted(), np.zeros(0), extent=2.0, pixels=4)
+    center = np.array([-1.5, -0.5, 0.5, 1.5])
+    expected = np.exp(-0.5 * ((center[:, None] - 1) ** 2 + center**2)) / (2 * np.pi)
     np.testing.assert_allclose(image, expected, rtol=1e-5)
-    with pytest.raises(ValueError, match=r"extent and cells must be positive, got 0 and 4"):
-        density_picture(model, th.zeros(0), extent=0, cells=4)
-
-
-def test_bad_input_is_named() -> None:
-    with pytest.raises(ValueError, match=r"model must be one of .*'realnvp'.*, got 'glow'"):
-        make_model("glow", 0, seed=0)
-    data = shifted_normal(10, 0)
-    with pytest.raises(ValueError, match=r"epochs must be at least 1, got 0"):
-        fit(Ensemble("realnvp", 0, SEEDS), data, data, Recipe(epochs=0))

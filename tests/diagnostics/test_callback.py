@@ -1,4 +1,4 @@
-"""The TensorBoard callback: what it logs, and that looking changes nothing."""
+"""The TensorBoard callback logs what it documents and does not change the run."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_one_action_has_no_correlation_to_draw(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
-def test_looking_does_not_change_the_run(policy: str) -> None:
+def test_measuring_does_not_change_the_run(policy: str) -> None:
     def train(callback: PolicyDiagnosticsCallback | None) -> th.Tensor:
         model = SACFlow(policy, "TunnelDiagonal-v0", **FAST).learn(250, callback=callback)
         return th.nn.utils.parameters_to_vector(model.policy.parameters()).detach()

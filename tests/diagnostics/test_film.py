@@ -1,4 +1,4 @@
-"""Films, sequences and curves."""
+"""Videos, sequences and curves."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.diagnostics.curves import curves_figure, main, read_evaluations
-from sb3_flowpolicy.diagnostics.film import episode_frames, sequence_figure, write_video
+from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
 
 pytest.importorskip("matplotlib")
 
 
 class Still:
-    """Stands in for a model: asks for nothing."""
+    """A stand-in for a model: all actions are zero."""
 
     def predict(self, obs: np.ndarray, *_: Any, **__: Any) -> tuple[np.ndarray, None]:
         return np.zeros((len(obs), 8), np.float32), None

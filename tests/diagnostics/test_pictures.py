@@ -22,7 +22,7 @@ pytest.importorskip("matplotlib")
 
 
 class Constant:
-    """Stands in for a model: always the same action."""
+    """A stand-in for a model: always the same action."""
 
     def __init__(self, *action: float) -> None:
         self.action = np.array(action, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The start-up hook, in interpreters that see only it and stand-ins for both packages."""
+"""The start-up hook, in interpreters with stand-ins for both packages."""
 
 import os
 import shutil
@@ -87,19 +87,19 @@ def test_modules_keep_their_own_loader(site):
     assert out[-1] == "SourceFileLoader True"
 
 
-def test_looking_for_a_module_does_not_use_the_hook_up(site):
+def test_finding_a_spec_does_not_use_up_the_hook(site):
     look = "import importlib.util as u; print(bool(u.find_spec('rl_zoo3.exp_manager').origin))\n"
     out, _ = run(site, "-c", INSTALL + look + ALL_TARGETS)
     assert out.count("plugged exp_manager") == 1
 
 
-def test_the_finder_leaves_when_it_is_done(site):
+def test_the_finder_is_removed_when_it_is_done(site):
     state = "import sys; print([type(f).__name__ for f in sys.meta_path].count('ZooFinder'))\n"
     out, _ = run(site, "-c", INSTALL + INSTALL + state + ALL_TARGETS + state)
     assert (out[0], out[-1]) == ("1", "0")
 
 
-def test_two_finders_that_ask_everybody_else_do_not_hang(site):
+def test_two_finders_that_delegate_to_each_other_do_not_hang(site):
     rival = (
         "import sys\n"
         "class Rival:\n"
@@ -127,7 +127,7 @@ def test_a_broken_install_costs_one_warning_and_nothing_else(site):
     assert "a_missing_package" in warnings[0]
 
 
-def test_an_error_of_rl_zoo3_stays_its_own(site):
+def test_errors_of_rl_zoo3_propagate(site):
     write(site, "rl_zoo3/utils.py", "raise RuntimeError('its own')\n")
     code = "try:\n import rl_zoo3.utils\nexcept RuntimeError as error:\n print(error)"
     out, err = run(site, "-c", INSTALL + code)
@@ -145,7 +145,7 @@ def test_starting_python_imports_the_hook_and_nothing_else(site, tmp_path_factor
     other = tmp_path_factory.mktemp("other")
     write(other, "other.pth", "import sys\n")
     code = (
-        # Whatever Python itself needs to read .pth files is not the hook's doing.
+        # Reading .pth files imports modules of its own.
         f"import sys, site; site.addsitedir({str(other)!r}); before = set(sys.modules)\n"
         f"site.addsitedir({str(site)!r})\n"
         "print(sorted(set(sys.modules) - before))"

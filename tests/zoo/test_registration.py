@@ -1,4 +1,4 @@
-"""What rl_zoo3 knows once we are registered."""
+"""The state of rl_zoo3 after registration."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Optuna: what is sampled, what is kept, and that a trial can be turned back into arguments."""
+"""Optuna: sampled values, kept values, and the way from a trial back to arguments."""
 
 import pytest
 
@@ -17,7 +17,7 @@ ADDITIONAL = {"using_her_replay_buffer": False, "her_kwargs": {}}
 
 @pytest.fixture
 def study():
-    """A study as rl_zoo3 makes it: the configured values are written down as text."""
+    """A study as rl_zoo3 creates it, with the configured values as text."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     study.set_user_attr("policy_kwargs", str(CONFIGURED))
