@@ -1,4 +1,4 @@
-"""Coloured noise, one number at a time: each is standard normal, successive ones correlate."""
+"""Colored noise, one number at a time: each is standard normal, successive ones correlate."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class NoiseProcess:
 
     Every value on its own is exactly standard normal, from the first step of an episode on. So at
     a fixed state a density that is handed this noise has the distribution it always has, while
-    successive actions lean the same way: the agent goes somewhere instead of trembling.
+    successive actions correlate: the agent moves somewhere instead of trembling on the spot.
 
     The process is a weighted sum of first-order autoregressions with correlation times from half a
     step to sixteen horizons. Unlike noise that is made in the frequency domain it needs no length
@@ -30,12 +30,12 @@ class NoiseProcess:
         n_envs: Number of environments N.
         color: Exponent :math:`\beta` of the spectrum, in [0, 1.5]: 0 is white, 1 pink.
         correlation_time: Steps after which the autocorrelation has fallen to 1/e, above 0: an
-            Ornstein-Uhlenbeck process, instead of a colour.
+            Ornstein-Uhlenbeck process, instead of a color.
         horizon: Steps of an episode, at least 2: the spectrum follows the power law for
             frequencies from 1/horizon to 1/2 and is flat below.
 
     Raises:
-        ValueError: If an argument is out of range, or both a colour and a correlation time are
+        ValueError: If an argument is out of range, or both a color and a correlation time are
             given.
 
     References:
@@ -99,11 +99,11 @@ class NoiseProcess:
         self._starting |= True if ended is None else th.as_tensor(ended).view(-1, 1, 1)
 
     def state(self) -> dict[str, th.Tensor]:
-        """Return what is needed to go on with the same process."""
+        """Return what is needed to continue the same process."""
         return {"values": self._values.clone(), "starting": self._starting.clone()}
 
     def set_state(self, state: dict[str, th.Tensor]) -> None:
-        """Go on where :meth:`state` was taken.
+        """Restore what :meth:`state` returned.
 
         Raises:
             ValueError: If the state belongs to a process of another size.

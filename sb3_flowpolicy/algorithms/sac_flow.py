@@ -54,7 +54,7 @@ class SACFlow(OffPolicyFlow, Shareable, SAC):
             ``{"controller": "flowpolicy_envs.Holder", "n_steps": 4000}``; see
             :func:`~sb3_flowpolicy.algorithms.demonstrations.follow_recipe`.
         critic_loss_coef: Factor of the critics' summed mean squared error, above 0: 0.5 as in
-            SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels but for
+            SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels except for
             weight decay, which weighs half as much at 1.0.
         compile: Whether to compile the update: several times faster after 10 to 30 seconds of
             warm-up. ``"auto"`` compiles once calls of :meth:`learn` have planned enough updates to

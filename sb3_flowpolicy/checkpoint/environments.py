@@ -1,4 +1,4 @@
-"""The state of environments, layer by layer, put into new ones of the same build."""
+"""The state of environments, layer by layer, and how to restore it in equally built ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import IO, Any
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-# How an environment was made, and open files: nothing that steps change.
+# How an environment was made, and open files: steps do not change them.
 _NOT_STATE = {"class_attributes", "env_fns", "spec", "_cached_spec", "results_writer"}
 
 LayerStates = dict[str, dict[str, Any]]
@@ -38,7 +38,7 @@ def layers(env: Any) -> dict[str, Any]:
 
 
 def _origin(layer: Any) -> str:
-    """Say how gymnasium made an innermost environment: another width is another environment."""
+    """Describe how gymnasium made an innermost environment, arguments included."""
     spec = vars(layer).get("spec")
     if spec is None or "env" in vars(layer):
         return ""
@@ -51,12 +51,12 @@ def _origin(layer: Any) -> str:
 
 
 def layer_states(env: Any, outside_only: bool = False) -> LayerStates:
-    """Collect what steps may change, of every layer; not copied.
+    """Collect what steps may change in every layer, without copying.
 
     Args:
         env: The environment.
-        outside_only: Leave out what may not be possible to pickle: all but SB3's wrappers around
-            vectorised environments, such as ``VecNormalize``.
+        outside_only: Collect only SB3's wrappers around vectorized environments, such as
+            ``VecNormalize``: what is inside may be impossible to pickle.
     """
     return {
         name: {key: value for key, value in vars(layer).items() if key not in _NOT_STATE}
@@ -66,7 +66,7 @@ def layer_states(env: Any, outside_only: bool = False) -> LayerStates:
 
 
 def set_layer_states(env: Any, states: Mapping[str, Mapping[str, Any]]) -> None:
-    """Put states that :func:`layer_states` collected into an environment of the same build."""
+    """Restore what :func:`layer_states` returned in an environment of the same build."""
     for name, layer in layers(env).items():
         vars(layer).update(states.get(name, {}))
 

@@ -1,4 +1,4 @@
-"""What a run has logged: log files as they were, and values that wait to be written."""
+"""What a run has logged: the contents of log files, and values not yet written."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def log_files(logger: Logger) -> dict[str, IO[str]]:
 def read_texts(files: Mapping[str, IO[str]]) -> dict[str, str]:
     """Read open files; those that were deleted are left out.
 
-    A file as a whole, not its length: whoever opens a log again empties it first.
+    Whole contents, not lengths: opening a log again empties it.
     """
     texts = {}
     for name, file in files.items():
@@ -52,7 +52,7 @@ def write_texts(files: Mapping[str, IO[str]], texts: Mapping[str, str]) -> None:
 
 
 def log_state(logger: Logger) -> dict[str, Any]:
-    """Collect what a logger has written and what it is about to write, but for pictures."""
+    """Collect what a logger has written and what it is about to write, except pictures."""
     kept = {key for key, value in logger.name_to_value.items() if is_data(value)}
     waiting = [
         {key: value for key, value in part.items() if key in kept} for part in _waiting(logger)
@@ -61,9 +61,9 @@ def log_state(logger: Logger) -> dict[str, Any]:
 
 
 def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) -> None:
-    """Go on where :func:`log_state` was taken.
+    """Restore what :func:`log_state` returned.
 
-    TensorBoard is told to hide what came after ``num_timesteps``.
+    TensorBoard will hide what came after ``num_timesteps``.
     """
     for part, saved in zip(_waiting(logger), state["waiting"], strict=True):
         part.clear()
@@ -74,11 +74,11 @@ def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) 
             header = state["texts"]["CSVOutputFormat"].partition("\n")[0]
             one.keys = header.split(one.separator) if header else []
         elif isinstance(one, TensorBoardOutputFormat):
-            # The writer begins a new file with its next event, which says where to go on.
+            # The writer begins a new file with its next event, which says where the run continues.
             one.writer.close()
             one.writer.purge_step = num_timesteps + 1
 
 
 def _waiting(logger: Logger) -> tuple[dict[str, Any], ...]:
-    """Return what is to be written next: values, how many each is the mean of, and not where."""
+    """Return the values to be written next, the counts of their means, and excluded formats."""
     return logger.name_to_value, logger.name_to_count, logger.name_to_excluded

@@ -1,4 +1,4 @@
-"""Pickles of objects that refer to others which exist already: environments, agents, callbacks."""
+"""Pickles of objects that refer to existing ones: environments, agents, callbacks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import cloudpickle
 import numpy as np
 import torch as th
 
-# Their objects pickle as handles, which mean nothing in another process.
+# Objects of these packages pickle as handles that are meaningless in another process.
 _SIMULATORS = ("pybullet",)
 
 
@@ -37,7 +37,7 @@ def is_data(value: Any) -> bool:
 
 
 def dumps(value: Any, known: Mapping[str, object]) -> bytes:
-    """Pickle ``value``; objects in ``known`` are noted by name, whatever they hold.
+    """Pickle ``value``; objects in ``known`` are stored by name, without their contents.
 
     Args:
         value: What to pickle.
@@ -77,8 +77,8 @@ class _Pickler(cloudpickle.Pickler):
         return name
 
     def reducer_override(self, thing: Any) -> Any:
-        # cloudpickle would copy what the main program defines: a resumed program, which defines it
-        # again, would then have two classes that are not each other.
+        # cloudpickle would copy classes of the main program. A resumed program defines them again,
+        # and would then have two different classes of the same name.
         named = isinstance(thing, type | FunctionType) and thing.__module__ == "__main__"
         if named and getattr(sys.modules["__main__"], thing.__qualname__, None) is thing:
             return NotImplemented

@@ -14,7 +14,7 @@ _MERGED_BYTES = 16_000_000
 
 
 class RingOwner(Protocol):
-    """A replay buffer: it knows where its next row goes."""
+    """A replay buffer with the position of its next row."""
 
     pos: int
     full: bool
@@ -68,7 +68,7 @@ class RowFiles:
     """Files that together hold a ring as it was at the last checkpoint.
 
     Args:
-        source: The buffer that the ring belongs to, to notice when it was replaced.
+        source: The buffer that the ring belongs to, to detect that it was replaced.
         segments: The files, oldest rows first.
         steps: Rows that had been added in the life of the agent.
     """
@@ -81,7 +81,7 @@ class RowFiles:
         self.steps = steps
 
     def update(self, source: RingOwner, ring: Ring, steps: int, path: Path) -> list[Segment]:
-        """Write the rows that are new; all, unless ``steps`` explains how the ring has moved.
+        """Write the new rows; all rows, unless ``steps`` explains how the ring has moved.
 
         Args:
             source: The buffer that the ring belongs to.

@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C as a wish to stop, that waits for the end of the step."""
+"""Defer SIGTERM and Ctrl-C to the end of a step."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _WATCHED = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignals:
-    """Notes the first SIGINT or SIGTERM; a second one acts at once, as ever.
+    """Notes the first SIGINT or SIGTERM; a second one takes effect at once.
 
-    Outside of the main thread, where Python does not let anybody watch signals, nothing is noted.
+    Python handles signals in the main thread only; in other threads nothing is noted.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class StopSignals:
         self._previous: dict[int, Any] = {}
 
     def watch(self) -> None:
-        """Note signals from now on, those excepted that the process ignores."""
+        """Note signals from now on, except those that the process ignores."""
         if threading.current_thread() is not threading.main_thread():
             return
         for number in _WATCHED:
@@ -32,12 +32,12 @@ class StopSignals:
                 signal.signal(number, self._note)
 
     def release(self) -> None:
-        """Give signals back to whoever handled them before."""
+        """Restore the previous signal handlers."""
         while self._previous:
             signal.signal(*self._previous.popitem())
 
     def deliver(self) -> None:
-        """Act on what was noted as if it arrived now.
+        """Deliver the noted signal as if it arrived now.
 
         Raises:
             KeyboardInterrupt: After SIGINT, unless the program handles that itself.
@@ -47,7 +47,7 @@ class StopSignals:
         if number is None:
             return
         if signal.getsignal(number) is signal.SIG_DFL:
-            # The default would end the process on the spot, without running anybody's `finally`.
+            # The default would end the process at once, without running any `finally`.
             raise SystemExit(128 + number)
         signal.raise_signal(number)
 

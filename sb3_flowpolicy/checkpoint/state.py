@@ -1,4 +1,4 @@
-"""The state of a run, less its networks and replay buffer, as bytes and back."""
+"""The state of a run without its networks and replay buffer, to bytes and back."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ _ATTRIBUTES = (
 
 @dataclass
 class Run:
-    """What a checkpoint is of: one agent, or several in lockstep.
+    """What a checkpoint consists of: one agent, or several in lockstep.
 
     Args:
         kind: Name of the class that can resume it.
         agents: Agents by the name of their files.
         environments: Environments by name.
         ring: Returns the replay buffer and its contents; None if it is not made of rows.
-        extra: Returns what else there is to note.
-        set_extra: Puts it back.
+        extra: Returns the state of the rest.
+        set_extra: Restores it.
         callbacks: The callback that each agent's ``learn`` was given, while it runs.
     """
 
@@ -65,7 +65,7 @@ class Run:
         return next(iter(self.agents.values()))
 
     def known(self) -> dict[str, object]:
-        """Name what exists in a resumed run, too."""
+        """Name the objects that exist in a resumed run, too."""
         found: dict[str, object] = {}
         for name, env in {**self.environments, **self.callback_environments()}.items():
             found |= {f"{name}/{place}": layer for place, layer in environments.layers(env).items()}
@@ -102,7 +102,7 @@ class Run:
 
 
 def collect(run: Run) -> dict[str, bytes]:
-    """Pickle the state of a run, in the two parts that are put back at different times.
+    """Pickle the state of a run, in the two parts that are restored at different times.
 
     Environments that cannot be pickled are left out, with one warning.
     """
@@ -114,7 +114,7 @@ def collect(run: Run) -> dict[str, bytes]:
 
 
 def restore_early(run: Run, pickled: bytes) -> None:
-    """Put back attributes and environments; new episodes begin where that is not possible."""
+    """Restore attributes and environments; begin new episodes where that is not possible."""
     known = run.known()
     state = pickling.loads(pickled, known)
     for name, agent in run.agents.items():
@@ -128,11 +128,11 @@ def restore_early(run: Run, pickled: bytes) -> None:
         agent = run.agents[name]
         agent._last_obs = None
         if agent.seed is not None and agent.env is not None:
-            # Otherwise it would live through its first episodes once more.
+            # Otherwise it would repeat its first episodes.
             agent.env.seed(agent.seed + agent.num_timesteps)
     if run.opaque & set(run.environments):
         warnings.warn(
-            "resuming begins new episodes, as the environment could not be saved: the run goes on, "
+            "resuming begins new episodes, as the environment could not be saved: the run continues, "
             "but not exactly as it would have",
             RuntimeWarning,
             stacklevel=4,
@@ -140,14 +140,14 @@ def restore_early(run: Run, pickled: bytes) -> None:
 
 
 def restore_late(run: Run, pickled: bytes) -> None:
-    """Put back what beginning to learn has touched: random numbers, clocks, callbacks, logs."""
+    """Restore what beginning to learn has changed: random numbers, clocks, callbacks, logs."""
     known = run.known()
     state = pickling.loads(pickled, known)
     for name, agent in run.agents.items():
         mine = state["agents"][name]
         agent.start_time = time.time_ns() - mine["elapsed"]
         agent._num_timesteps_at_start = mine["begun"]
-        if agent.action_noise is not None:  # in place: the loop that has begun holds this one
+        if agent.action_noise is not None:  # in place: the running loop holds this object
             vars(agent.action_noise).update(mine["action_noise"])
         logs.set_log_state(agent.logger, mine["log"], agent.num_timesteps)
     for name, env in run.callback_environments().items():
@@ -203,10 +203,10 @@ def _late(run: Run) -> dict[str, Any]:
 def _pickle_around_environments(
     run: Run, collect: Callable[[], dict[str, Any]], known: Mapping[str, object]
 ) -> bytes:
-    """Pickle; where that fails, find the environments to blame and leave them out from now on."""
+    """Pickle; if that fails, leave out the environments that cannot be pickled from now on."""
     try:
         return pickling.dumps(collect(), known)
-    except Exception:  # whatever somebody's environment raises
+    except Exception:  # anything a user's environment raises
         for name, env in {**run.environments, **run.callback_environments()}.items():
             try:
                 pickling.dumps(environments.layer_states(env), known)
@@ -222,9 +222,9 @@ def _pickle_around_environments(
 
 
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
-    """Collect a callback's counters and records: what is made of numbers, text and arrays.
+    """Collect a callback's counters and records: attributes made of numbers, text and arrays.
 
-    Attributes named as arguments of its constructor are left out: settings, which may be changed.
+    Attributes named like arguments of its constructor are settings and may change: left out.
     """
     settings = {name for kind in type(callback).__mro__ for name in _arguments(kind)}
     return {

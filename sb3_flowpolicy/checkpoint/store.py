@@ -29,7 +29,7 @@ class Checkpoint:
 
     Args:
         folder: Where its files are.
-        manifest: What it says about itself: ``kind``, ``num_timesteps``, ``segments``, ...
+        manifest: Its description: ``kind``, ``num_timesteps``, ``segments``, ...
     """
 
     folder: Path
@@ -57,7 +57,7 @@ class CheckpointStore:
         self._good: list[Checkpoint] = []
 
     def folders(self) -> list[Path]:
-        """Return the folders of checkpoints, oldest first, be they damaged or not."""
+        """Return the folders of checkpoints, damaged ones included, oldest first."""
         found = self.path.glob("[0-9]*-step-*")
         return sorted((one for one in found if _NAME.fullmatch(one.name)), key=_number)
 
@@ -161,7 +161,7 @@ def _number(folder: Path) -> int:
 
 
 class _DamagedError(Exception):
-    """A checkpoint is not what its manifest says."""
+    """A checkpoint disagrees with its manifest."""
 
 
 def _damage(folder: Path) -> str:
@@ -173,7 +173,7 @@ def _damage(folder: Path) -> str:
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Read a manifest and check what it says about files."""
+    """Read a manifest and check the files that it lists."""
     try:
         facts = json.loads((folder / _MANIFEST).read_bytes())
         seal = facts.pop("sha256")
@@ -200,7 +200,7 @@ def _seal(facts: dict[str, Any]) -> str:
 
 
 def _digest(path: Path, synchronize: bool = False) -> str:
-    """Return a file's SHA-256, and see to it that the file is on the disk."""
+    """Return a file's SHA-256, optionally after making sure that it is on the disk."""
     if synchronize:
         _synchronize(path)
     digest = hashlib.sha256()

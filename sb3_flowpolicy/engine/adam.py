@@ -21,7 +21,7 @@ class AdamSettings:
 
 
 def adam_settings(optimizer: th.optim.Optimizer) -> AdamSettings | None:
-    """Return the settings of an Adam or AdamW that we can take over, None for any other."""
+    """Return the settings of a plain Adam or AdamW, None for any other optimizer."""
     if type(optimizer) not in (th.optim.Adam, th.optim.AdamW) or len(optimizer.param_groups) != 1:
         return None
     group = optimizer.param_groups[0]
@@ -33,13 +33,13 @@ def adam_settings(optimizer: th.optim.Optimizer) -> AdamSettings | None:
 
 
 def took_equal_steps(optimizer: th.optim.Optimizer) -> bool:
-    """Whether all parameters have taken as many steps: a part may have been reset."""
+    """Whether all parameters have taken the same number of steps: some may have been reset."""
     states = [optimizer.state.get(owner, {}) for owner in optimizer.param_groups[0]["params"]]
     return len({float(state.get("step", 0)) for state in states}) <= 1
 
 
 class FlatAdam:
-    """Moments of S optimisers as tensors (S, P); the optimisers' own states become views.
+    """Moments of S optimizers as tensors (S, P); the optimizers' own states become views.
 
     Args:
         flat: The parameters.
@@ -56,10 +56,10 @@ class FlatAdam:
         self.bind()
 
     def bind(self) -> None:
-        """Take over the optimisers' states and make them views of ours."""
+        """Take over the optimizers' states and make them views of ours."""
         data = self.flat.data
         self.mean, self.square = th.zeros_like(data), th.zeros_like(data)
-        # One count per parameter, as in torch.optim, though they never differ.
+        # One count per parameter, as in torch.optim, although they never differ.
         n_owners = len(self.flat.views(data, 0))
         self.step = th.zeros(len(data), n_owners, device=data.device)
         self._bound = []
@@ -78,7 +78,7 @@ class FlatAdam:
             self._bound.append((optimizer, optimizer.state, entries))
 
     def is_bound(self) -> bool:
-        """Whether the optimisers' states still are views: loading or resetting one undoes it."""
+        """Whether the optimizers' states are still views: loading or resetting one undoes it."""
         for optimizer, state, entries in self._bound:
             if optimizer.state is not state or len(state) != len(entries):
                 return False
@@ -91,7 +91,7 @@ class FlatAdam:
         return True
 
     def release(self) -> None:
-        """Give the optimisers memory of their own again."""
+        """Give the optimizers memory of their own again."""
         for optimizer in self.optimizers:
             for state in optimizer.state.values():
                 for key in ("step", "exp_avg", "exp_avg_sq"):

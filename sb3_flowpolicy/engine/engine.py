@@ -295,7 +295,7 @@ class Engine:
         """
         first = self.models[0]
         optimizers = [first.actor.optimizer, first.critic.optimizer]
-        # A fixed entropy coefficient takes no steps, at whatever rate.
+        # A fixed entropy coefficient takes no steps.
         optimizers.append(first.ent_coef_optimizer or first.actor.optimizer)
         rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
         if self._learning_rates is None or self._learning_rates[0] != rates:

@@ -12,10 +12,10 @@ Layout = Mapping[str, Sequence[nn.Parameter]]
 
 
 class FlatParameters:
-    """One tensor (S, P) of which the parameters of S equal networks become views.
+    """One tensor (S, P) whose parts are the parameters of S equal networks.
 
-    An optimiser step, a target update or a gradient is then one operation, not one per parameter,
-    and modules, SB3's checkpoints and ``torch.optim`` go on seeing ordinary parameters.
+    An optimizer step, a target update or a gradient is then one operation instead of one per
+    parameter, and modules, SB3's checkpoints and ``torch.optim`` still see ordinary parameters.
 
     Args:
         layouts: Per seed, entry name -> its copies: one parameter, or the same parameter of each
@@ -65,8 +65,8 @@ class FlatParameters:
         self._addresses = [(owner, owner.data_ptr()) for owner in owners]
 
     def is_bound(self) -> bool:
-        """Whether the parameters still are views: moving or reassigning a module undoes it."""
-        for owner, address in self._addresses:  # noqa: SIM110 - before every update: half the time
+        """Whether the parameters are still views: moving or reassigning a module undoes it."""
+        for owner, address in self._addresses:  # noqa: SIM110 - takes half the time
             if owner.data_ptr() != address:
                 return False
         return True

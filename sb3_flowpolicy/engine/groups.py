@@ -1,4 +1,4 @@
-"""How many seeds to update at once: what does not fit the cache is slower together than in turn."""
+"""Update only as many seeds together as fit the cache."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 # Measured on a core with 2 MiB of second-level cache, batches of 256, ten seeds, two critics:
-# networks of 32 units are fastest ten at a time, of 64 five, of 128 two, of 256 one by one.
+# networks of 32 units are fastest ten at a time, 64 units five, 128 units two, 256 units one.
 BYTES_AT_ONCE = 700_000
 
 

@@ -15,7 +15,7 @@ from sb3_flowpolicy.policies import FlowActor
 
 
 class _ActionLogProb(nn.Module):
-    """``functional_call`` calls ``forward``: this one samples and scores."""
+    """Samples and scores in ``forward``, which is what ``functional_call`` calls."""
 
     def __init__(self, actor: FlowActor) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class StackedNetworks:
             if len(actor) > 1:
                 actions, log_prob = vmap(self._sample_one)(parameters, obs, noise)
             else:
-                # No detour for one seed: vmap would turn products into batched ones.
+                # Without vmap for one seed: it would turn products into slower, batched ones.
                 single = {name: value.squeeze(0) for name, value in parameters.items()}
                 actions, log_prob = self._sample_one(single, obs.squeeze(0), noise.squeeze(0))
                 actions, log_prob = actions.unsqueeze(0), log_prob.unsqueeze(0)
@@ -108,6 +108,6 @@ def _actor_layout(policy: SACPolicy) -> Layout:
 
 
 def _critic_layout(critic: ContinuousCritic) -> Layout:
-    """Weight by weight, the copies of all C critics."""
+    """Return each weight's copies in all C critics."""
     copies = [dict(network.named_parameters()) for network in critic.q_networks]
     return {name: [copy[name] for copy in copies] for name in copies[0]}

@@ -1,4 +1,4 @@
-"""Replay buffers as rows: one transition, one row; one gather per ``train()`` call."""
+"""Replay buffers as rows, one per transition: a call of ``train()`` gathers once."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 def is_plain(buffer: ReplayBuffer) -> bool:
-    """Whether a buffer is SB3's own, which can be read as rows: n-step, HER and others sample."""
+    """Whether a buffer is SB3's plain one, which can be read as rows; n-step and HER cannot."""
     return type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage
 
 
 class ReplayRows:
     """Replay buffers of S agents as one array, (capacity, environments of all agents, width).
 
-    The buffers' own arrays become views of it: whoever writes to them, or saves them, goes on. All
-    columns are float32, which is what networks are shown of observations of any type.
+    The buffers' own arrays become views of it, so they can be written and saved as before. All
+    columns are float32, the type in which networks receive observations of any type.
 
     Args:
         buffers: Plain SB3 buffers (see :func:`is_plain`) of the same spaces, sizes and contents.
@@ -40,7 +40,7 @@ class ReplayRows:
         samples = [getattr(first, name) for name in COLUMNS]
         self.widths = [int(np.prod(sample.shape[2:])) for sample in samples]
         shape = (first.buffer_size, self.n_envs * len(buffers), sum(self.widths))
-        # Pages that nobody wrote to take no memory yet.
+        # Pages take no memory until they are written to.
         rows = np.zeros(shape, np.float32)
         self.columns = dict(zip(COLUMNS, self._views(rows, samples), strict=True))
         self._owned = []
@@ -83,7 +83,7 @@ class ReplayRows:
         obs, next_obs, actions, rewards, dones, timeouts = parts
         if len(self.obs_shape) != 1:
             obs, next_obs = (part.unflatten(-1, self.obs_shape) for part in (obs, next_obs))
-        # A time limit is no end of the world: its value is bootstrapped.
+        # A time limit does not end the task: the value of the last state is bootstrapped.
         ends = (dones * (1 - timeouts)).squeeze(-1)
         discounts = _constant(gamma, tuple(index.shape[1:]), noise.dtype, noise.device)
         rewards = rewards.squeeze(-1)
@@ -94,7 +94,7 @@ class ReplayRows:
 
 
 def draw_index(buffers: Sequence[ReplayBuffer], n_updates: int, batch_size: int) -> th.Tensor:
-    """Draw transitions with the random numbers that SB3's own sampling would take.
+    """Draw transitions with the same random numbers as SB3's own sampling.
 
     Returns:
         Indices, (n_updates, S, batch_size), counted over all environments of all agents.
@@ -121,17 +121,17 @@ def sample_columns(
     gamma: float,
     env: VecNormalize | None = None,
 ) -> list[th.Tensor]:
-    """Ask a buffer for minibatches itself, once for all updates: n-step, HER, VecNormalize, ...
+    """Let a buffer sample, once for all updates: n-step, HER, VecNormalize, ...
 
     Args:
         buffer: SB3's replay buffer, not empty.
         n_updates: Number of minibatches.
         batch_size: Transitions per minibatch.
         gamma: Discount factor, where the buffer does not bring its own.
-        env: ``VecNormalize`` that normalises observations and rewards.
+        env: ``VecNormalize`` that normalizes observations and rewards.
 
     Returns:
-        The fields of :class:`Batch` but for the noise, each (n_updates, 1, batch_size, ...).
+        The fields of :class:`Batch` except the noise, each (n_updates, 1, batch_size, ...).
     """
     samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
     discounts = samples.discounts
@@ -152,5 +152,5 @@ def sample_columns(
 def _constant(
     value: float, shape: tuple[int, ...], dtype: th.dtype, device: th.device
 ) -> th.Tensor:
-    # Rewards and discounts are float32 in SB3's buffers, whatever the networks are.
+    # SB3's buffers hold rewards and discounts in float32, also for networks of another type.
     return th.full(shape, value, device=device).to(dtype)

@@ -167,7 +167,9 @@ class TrainingGuard:
         if restored is not None:
             message += f"Weights and optimizers are back at update {restored}. "
         if self.resume_from is not None:
-            message += f"resume({str(self.resume_from)!r}, env) goes on from the last checkpoint. "
+            message += (
+                f"resume({str(self.resume_from)!r}, env) continues from the last checkpoint. "
+            )
         message += "Look for extreme rewards and observations, or lower the learning rate"
         raise NonFiniteError(
             message, name, value, model.num_timesteps, update, seed, summary, restored

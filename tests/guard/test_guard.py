@@ -270,7 +270,9 @@ def test_checkpoints_are_mentioned_where_there_are_some() -> None:
         model.train(1, batch_size=16)
     assert "resume" not in str(caught.value)
     model._guard.restart("runs/tunnel")
-    with pytest.raises(NonFiniteError, match=r"resume\('runs/tunnel', env\) goes on from the last"):
+    with pytest.raises(
+        NonFiniteError, match=r"resume\('runs/tunnel', env\) continues from the last"
+    ):
         model.train(1, batch_size=16)
 
 
