@@ -132,8 +132,8 @@ def restore_early(run: Run, pickled: bytes) -> None:
             agent.env.seed(agent.seed + agent.num_timesteps)
     if run.opaque & set(run.environments):
         warnings.warn(
-            "resuming begins new episodes, as the environment could not be saved: the run continues, "
-            "but not exactly as it would have",
+            "resuming begins new episodes, as the environment could not be saved: the run "
+            "continues, but not exactly as it would have",
             RuntimeWarning,
             stacklevel=4,
         )

@@ -168,7 +168,7 @@ class TrainingGuard:
             message += f"Weights and optimizers are back at update {restored}. "
         if self.resume_from is not None:
             message += (
-                f"resume({str(self.resume_from)!r}, env) continues from the last checkpoint. "
+                f"resume({str(self.resume_from)!r}, env) continues from a checkpoint. "
             )
         message += "Look for extreme rewards and observations, or lower the learning rate"
         raise NonFiniteError(
