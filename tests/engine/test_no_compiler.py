@@ -59,11 +59,7 @@ def test_torch_lacks_a_feature(missing: str, monkeypatch: pytest.MonkeyPatch) ->
         options = {"cpp.of_another_version": True}
         monkeypatch.setattr("sb3_flowpolicy.engine.compiling._options", lambda device: options)
     elif missing.startswith("_dynamo"):
-        import torch._dynamo
-
-        fields = {**th._dynamo.config._config}
-        del fields["trace_autograd_ops"]
-        monkeypatch.setattr(th._dynamo.config, "_config", fields)
+        monkeypatch.delitem(th._dynamo.config._config, "trace_autograd_ops")
     else:
         monkeypatch.delattr(f"torch.{missing}")
     x = th.linspace(-1, 1, 5)
