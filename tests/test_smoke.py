@@ -34,8 +34,8 @@ def test_train_save_and_load(model, tmp_path):
     model.save(tmp_path / "model")
     loaded = SACFlow.load(tmp_path / "model", device="cpu")
     obs = model.observation_space.sample()
-    for one, other in zip(*(m.predict(obs, deterministic=True) for m in (model, loaded))):
-        assert np.array_equal(one, other)
+    one, other = (m.predict(obs, deterministic=True)[0] for m in (model, loaded))
+    assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("env_id", ["TunnelDiagonal-v0", "SquareHold-v0"])
