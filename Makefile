@@ -1,6 +1,7 @@
 # `make train` and `make test` need nothing but Python 3.11 and make.
 PYTHON ?= python3
 VENV ?= .venv
+LOWEST ?= .venv-lowest
 BIN := $(VENV)/bin
 ALGO ?= sac_flow
 ENV ?= TunnelDiagonal-v0
@@ -8,15 +9,16 @@ SEED ?= 1
 LOGS ?= logs
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint types check clean
+.PHONY: help train test lowest sb3-tests lint types check clean
 
 help:  ## Show this help
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
 
 # The stamp is remade only when the requirements change, so repeated calls start at once.
+# Python compiles what it imports; compiling all of every package would take a minute more.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[all,dev]"
+	$(BIN)/pip install --quiet --no-compile --constraint constraints.txt --editable ".[all,dev]"
 	touch $@
 
 train: $(VENV)/.installed  ## Train ALGO on ENV with SEED, print the success rate, draw the policy
@@ -28,6 +30,18 @@ train: $(VENV)/.installed  ## Train ALGO on ENV with SEED, print the success rat
 test: $(VENV)/.installed  ## Run the tests
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
+$(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
+	test -x $(LOWEST)/bin/python || $(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/pip install --quiet --no-compile --constraint constraints-lowest.txt \
+		--editable ".[zoo,contrib]" pytest
+	touch $@
+
+lowest: $(LOWEST)/.installed  ## Run the smoke tests with the lowest versions allowed
+	$(LOWEST)/bin/python -m pytest -m smoke tests/test_smoke.py
+
+sb3-tests: $(VENV)/.installed  ## Run the SAC tests of the stable-baselines3 checkout SB3 with SACFlow
+	$(BIN)/python tests/sb3_own_tests.py $(SB3)
+
 lint: $(VENV)/.installed  ## Check style
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -37,5 +51,5 @@ types: $(VENV)/.installed  ## Check types
 
 check: lint types test  ## Everything that has to pass before a commit lands
 
-clean:  ## Remove the virtual environment and caches
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache
+clean:  ## Remove the virtual environments and caches
+	rm -rf $(VENV) $(LOWEST) .mypy_cache .pytest_cache .ruff_cache

@@ -17,7 +17,7 @@ class Compiled:
 
     Compilation happens at the first call, which says so: the SAC update takes 10 to 30 seconds,
     less from the second run on, as torch caches it on disk. Where it fails, for want of a C++
-    compiler say, the function runs eagerly ever after, with one warning.
+    compiler or of a feature of torch, the function runs eagerly from then on, with one warning.
 
     Args:
         function: Function of tensors; its closure must not change.
@@ -29,16 +29,8 @@ class Compiled:
         self.function = function
         self.name = name
         self.broken = False
+        self._device = device
         self._graphs: dict[Hashable, Callable[..., Any]] = {}
-        # Dynamo would check at each call that modules and shapes are those it compiled for, which
-        # takes as long as the update of a small network. Here the caller knows: see __call__.
-        self._options: dict[str, Any] = {"guard_filter_fn": th.compiler.skip_all_guards_unsafe}
-        # Inductor would leave loops over two or three action dimensions scalar: exp, tanh and
-        # log1p then cost as much as all products of a small network together.
-        self._options["cpp.enable_tiling_heuristics"] = False
-        # Launching kernels from Python would cost more than running them.
-        faster = "triton.cudagraphs" if device.type == "cuda" else "cpp_wrapper"
-        self._options[faster] = True
 
     def __call__(self, key: Hashable, *arguments: Any) -> Any:
         """Call the function.
@@ -58,23 +50,46 @@ class Compiled:
         # A function of its own per graph: dynamo keeps its graphs with a function's code.
         code = self.function.__code__.replace()
         function = FunctionType(code, self.function.__globals__, closure=self.function.__closure__)
-        graph = th.compile(function, fullgraph=True, dynamic=False, options=self._options)
+        try:
+            graph = th.compile(
+                function, fullgraph=True, dynamic=False, options=_options(self._device)
+            )
+        except (AttributeError, RuntimeError) as error:  # this torch or Python lacks a feature
+            return self._run_eagerly(error, *arguments)
         try:
             # Lets torch.autograd.grad be traced; switched on for our graph alone.
             with th._dynamo.config.patch(trace_autograd_ops=True):
                 result = graph(*arguments)
         except (th._dynamo.exc.TorchDynamoException, th._inductor.exc.InductorError) as error:
-            self.broken = True
-            warnings.warn(
-                f"{self.name} could not be compiled and runs eagerly: the same numbers, only "
-                f"slower ({type(error).__name__}: {str(error).strip().splitlines()[0]})",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-            return self.function(*arguments)
+            return self._run_eagerly(error, *arguments)
         _say(f"Compiled {self.name} in {time.perf_counter() - start:.0f} s")
         self._graphs[key] = graph
         return result
+
+    def _run_eagerly(self, error: Exception, *arguments: Any) -> Any:
+        self.broken = True
+        warnings.warn(
+            f"{self.name} could not be compiled and runs eagerly: the same numbers, only "
+            f"slower ({type(error).__name__}: {str(error).strip().splitlines()[0]})",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+        return self.function(*arguments)
+
+
+def _options(device: th.device) -> dict[str, Any]:
+    """Return the options for the device, or raise AttributeError if torch lacks a feature."""
+    th._dynamo.config.trace_autograd_ops  # noqa: B018 (new in torch 2.11)
+    return {
+        # Dynamo would check at each call that modules and shapes are those it compiled for, which
+        # takes as long as the update of a small network. Here the caller knows: see __call__.
+        "guard_filter_fn": th.compiler.skip_all_guards_unsafe,
+        # Inductor would leave loops over two or three action dimensions scalar: exp, tanh and
+        # log1p then cost as much as all products of a small network together.
+        "cpp.enable_tiling_heuristics": False,
+        # Launching kernels from Python would cost more than running them.
+        "triton.cudagraphs" if device.type == "cuda" else "cpp_wrapper": True,
+    }
 
 
 def _say(text: str) -> None:

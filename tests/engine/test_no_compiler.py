@@ -1,4 +1,4 @@
-"""Where there is no C++ compiler, training goes on eagerly: one warning, the same numbers."""
+"""Where torch cannot compile, training goes on eagerly: one warning, the same numbers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+import torch as th
+
+from sb3_flowpolicy.engine.compiling import Compiled
 
 TRAIN = """
 import sys, warnings, numpy as np, torch as th
@@ -44,3 +49,23 @@ def test_no_compiler(tmp_path: Path) -> None:
     assert train(False, tmp_path / "eager.npy") == 0
     got, expected = (np.load(tmp_path / f"{name}.npy") for name in ("hidden", "eager"))
     assert np.array_equal(got, expected)
+
+
+@pytest.mark.parametrize(
+    "missing", ["compiler.skip_all_guards_unsafe", "_dynamo.config.trace_autograd_ops", "option"]
+)
+def test_torch_lacks_a_feature(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if missing == "option":
+        options = {"cpp.of_another_version": True}
+        monkeypatch.setattr("sb3_flowpolicy.engine.compiling._options", lambda device: options)
+    elif missing.startswith("_dynamo"):
+        monkeypatch.delitem(th._dynamo.config._config, "trace_autograd_ops")
+    else:
+        monkeypatch.delattr(f"torch.{missing}")
+    x = th.linspace(-1, 1, 5)
+    compiled = Compiled(lambda x: (x.exp() * 3, x.sum()), "the test", th.device("cpu"))
+    with pytest.warns(RuntimeWarning, match="the test could not be compiled") as caught:
+        results = [compiled("key", x), compiled("key", x), compiled("other", x[:2])]
+    assert len(caught) == 1
+    for result, values in zip(results, (x, x, x[:2]), strict=True):
+        assert all(map(th.equal, result, (values.exp() * 3, values.sum())))
