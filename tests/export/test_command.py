@@ -83,6 +83,7 @@ def test_where_statistics_are_looked_for(tmp_path: Path) -> None:
         (["safe", "text.zip"], "text.zip must be a bundle written by save_safe: a header of"),
         (["onnx", "empty.zip"], "MODEL must be a model that SACFlow or SAC saved, got empty.zip"),
         (["onnx", "stock.zip"], "model must have a policy of sb3_flowpolicy"),
+        (["safe", "stock.zip"], "policy_class must be one of"),
         (["safe", "model.zip", "--stochastic"], "--stochastic is for onnx"),
         (["safe", "model.zip", "--vecnormalize", "x"], "--vecnormalize must be a file that exists"),
         (
