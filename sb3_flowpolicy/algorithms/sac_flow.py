@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flowpolicy.algorithms.demonstrations import (
@@ -23,7 +24,7 @@ from sb3_flowpolicy.algorithms.demonstrations import (
     load_demonstrations,
 )
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
-from sb3_flowpolicy.bundle.shareable import Shareable
+from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
 from sb3_flowpolicy.common.validation import check_settings, either, flag, number, optional
 from sb3_flowpolicy.engine import LOSSES, EngineRuntime
 from sb3_flowpolicy.policies import sac
@@ -33,8 +34,10 @@ from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 SB3_CRITIC_LOSS_COEF = 0.5
 MOST_DRAWN_AT_ONCE = 1000
 
+SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
 
-class SACFlow(OffPolicyFlow, Shareable, SAC):
+
+class SACFlow(OffPolicyFlow, SAC):
     r"""Soft Actor-Critic with action distributions that correlate and bend.
 
     Everything of SB3's :class:`~stable_baselines3.SAC` holds: ``ent_coef=0.01`` fixes the entropy
@@ -93,6 +96,8 @@ class SACFlow(OffPolicyFlow, Shareable, SAC):
         "autocast": flag,
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = sac.ALIASES
+    #: Statistics of ``VecNormalize`` from a bundle that was loaded without an environment.
+    normalization: Normalization | None = None
 
     def __init__(
         self,
@@ -146,6 +151,59 @@ class SACFlow(OffPolicyFlow, Shareable, SAC):
         return fill_replay_buffer(
             self.replay_buffer, self.policy, load_demonstrations(demonstrations)
         )
+
+    def save_safe(self, path: str | Path, vec_normalize: VecNormalize | None = None) -> Path:
+        """Write a safe bundle: one file to share, as loading it executes no code.
+
+        It holds the policy, target networks, optimizers, all settings, and the statistics of
+        ``VecNormalize``, but not the replay buffer; see ``docs/guide/sharing.md``.
+
+        Args:
+            path: File to write, ``.safetensors`` if it has no suffix.
+            vec_normalize: Statistics to include. Default: those of the model's environment.
+
+        Returns:
+            The file's path.
+
+        Raises:
+            ValueError: If the model has a part that needs code, such as your own features
+                extractor or a learning rate that is a function; the message names it.
+
+        Example:
+            >>> import tempfile
+            >>> import numpy as np
+            >>> from sb3_flowpolicy import SACFlow
+            >>> model = SACFlow("FlowPolicy", "Pendulum-v1")
+            >>> path = model.save_safe(tempfile.mkdtemp() + "/pendulum")
+            >>> SACFlow.load_safe(path).predict(np.zeros(3), deterministic=True)[0].shape
+            (1,)
+        """
+        return save_bundle(self, path, vec_normalize)
+
+    @classmethod
+    def load_safe(
+        cls: type[SelfSACFlow],
+        path: str | Path,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+    ) -> SelfSACFlow:
+        """Read a file of :meth:`save_safe` without executing anything that it names.
+
+        Args:
+            path: The file.
+            env: Environment to train in, without ``VecNormalize``: the bundle's statistics, if
+                any, are wrapped around it. Default: none, to predict only; normalize
+                observations with ``model.normalization`` if that is not None.
+            device: Device of the model.
+
+        Returns:
+            The model.
+
+        Raises:
+            BundleError: A ``ValueError``, if the file is damaged or holds no such model.
+            ValueError: If ``env`` has other spaces.
+        """
+        return load_bundle(cls, path, env, device)
 
     def learn(
         self, total_timesteps: int, callback: MaybeCallback = None, *args: Any, **kwargs: Any

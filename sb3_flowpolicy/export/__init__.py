@@ -1,4 +1,4 @@
-"""Policies that leave: safe bundles for colleagues, ONNX for machines without torch."""
+"""Export models to safe bundles (safetensors) and to ONNX."""
 
 from sb3_flowpolicy.export.onnx_export import export_onnx
 

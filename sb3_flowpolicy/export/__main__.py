@@ -1,4 +1,4 @@
-"""`python -m sb3_flowpolicy.export`: a trained model as a safe bundle or an ONNX file."""
+"""`python -m sb3_flowpolicy.export`: write a trained model as a safe bundle or an ONNX file."""
 
 from __future__ import annotations
 
@@ -21,29 +21,48 @@ examples:
   %(prog)s onnx logs/sac_flow/TunnelDiagonal-v0_1/best_model.zip --output robot.onnx
   %(prog)s onnx model.safetensors --stochastic
 
-MODEL is a zip that SACFlow.save, SAC.save with one of our policies, or rl_zoo3 wrote, or a safe
-bundle. A zip and vecnormalize.pkl are pickles, and loading one runs whatever code is in it: export
-your own, and give others the result. A safe bundle runs nothing.
+MODEL is a zip of SACFlow.save, of SAC.save with one of our policies, or of rl_zoo3, or a safe
+bundle. Zips and vecnormalize.pkl are pickles, and loading a pickle runs the code in it: export your
+own, and share the result. Loading a safe bundle runs no code.
 """
+_SUFFIXES = {"safe": SUFFIX, "onnx": ".onnx"}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Export the model that the command line names, and print where to.
+    """Export the model that the command line names, and print the path of the result.
 
     Args:
         arguments: Command line without the program's name. Default: that of the process.
     """
-    parser = _parser()
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.export",
+        description="Write a trained model to a file that can be shared safely (safe), or to one "
+        "that runs without torch (onnx).",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("format", choices=_SUFFIXES, help="safe: a bundle for SACFlow.load_safe; onnx: a graph")
+    add("model", type=Path, metavar="MODEL", help="zip or safe bundle")
+    add("-o", "--output", type=Path, help="file to write (default: MODEL with the new suffix)")
+    add(
+        "--vecnormalize",
+        type=Path,
+        metavar="FILE",
+        help="statistics to include (default: the vecnormalize.pkl that rl_zoo3 saved with MODEL)",
+    )
+    add("--stochastic", action="store_true", help="onnx: also sample, with noise as an input")
     args = parser.parse_args(arguments)
     try:
         if args.stochastic and args.format == "safe":
             raise ValueError("--stochastic is for onnx: a safe bundle can always sample")
         model = _load_model(args.model)
-        # Beside a bundle no pickle is looked for: a bundle has its statistics inside.
-        beside = find_statistics(args.model) if zipfile.is_zipfile(args.model) else None
-        statistics = args.vecnormalize or beside
+        statistics = args.vecnormalize
+        # A bundle contains its statistics, so no pickle next to it is opened.
+        if statistics is None and zipfile.is_zipfile(args.model):
+            statistics = find_statistics(args.model)
         vec_normalize = None if statistics is None else _load_statistics(statistics)
-        output = args.output or args.model.with_suffix("." + _SUFFIXES[args.format])
+        output = args.output or args.model.with_suffix(_SUFFIXES[args.format])
         if args.format == "safe":
             path = model.save_safe(output, vec_normalize)
         else:
@@ -53,58 +72,29 @@ def main(arguments: list[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         parser.exit(2, f"{parser.prog}: {error}\n")
     except ModuleNotFoundError as error:
-        parser.exit(2, f'{parser.prog}: {error}; pip install "sb3_flowpolicy[export]" brings it\n')
-    inside = f" with the statistics of {statistics}" if statistics is not None else ""
-    print(f"{path}: {path.stat().st_size / 1024:.0f} KiB{inside}")
-
-
-_SUFFIXES = {"safe": SUFFIX.removeprefix("."), "onnx": "onnx"}
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_flowpolicy.export",
-        description="Turn a trained model into a file that can be shared without sharing code "
-        "(safe), or into one that runs without torch (onnx).",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = parser.add_argument
-    add("format", choices=_SUFFIXES, help="safe: a bundle for SACFlow.load_safe; onnx: a graph")
-    add("model", type=Path, metavar="MODEL", help="zip or safe bundle")
-    add("-o", "--output", type=Path, help="file to write (default: beside MODEL, named like it)")
-    add(
-        "--vecnormalize",
-        type=Path,
-        metavar="FILE",
-        help="statistics to include (default: vecnormalize.pkl where rl_zoo3 puts it)",
-    )
-    add("--stochastic", action="store_true", help="onnx: also a sampled action, noise is an input")
-    return parser
+        parser.exit(2, f'{parser.prog}: {error}; install it with "sb3_flowpolicy[export]"\n')
+    included = f" with the statistics of {statistics}" if statistics is not None else ""
+    print(f"{path}: {path.stat().st_size / 1024:.0f} KiB{included}")
 
 
 def find_statistics(model: Path) -> Path | None:
-    """Return the ``vecnormalize.pkl`` that belongs to a model, where there is one.
+    """Return the ``vecnormalize.pkl`` that belongs to a model, if there is one.
 
     rl_zoo3 writes ``ENV_1/ENV.zip`` and ``ENV_1/ENV/vecnormalize.pkl``; SB3's checkpoints are
     ``rl_model_500_steps.zip`` and ``rl_model_vecnormalize_500_steps.pkl``.
 
     Raises:
-        ValueError: If there are several, and none of these.
+        ValueError: If there are several, and none has the model's name.
     """
     folder, (stem, _, steps) = model.parent, model.stem.partition("_model_")
-    checkpoint = folder / f"{stem}_model_vecnormalize_{steps}.pkl"
-    if steps and checkpoint.is_file():
-        return checkpoint
-    beside = folder / "vecnormalize.pkl"
-    if beside.is_file():
-        return beside
-    found = sorted(folder.glob("*/vecnormalize.pkl"))
-    own = folder / model.stem / "vecnormalize.pkl"
-    if own in found:
-        return own
-    if len(found) > 1:
-        names = ", ".join(map(str, found))
+    own = (
+        *([folder / f"{stem}_model_vecnormalize_{steps}.pkl"] if steps else []),
+        folder / "vecnormalize.pkl",
+        folder / model.stem / "vecnormalize.pkl",
+    )
+    found = [path for path in own if path.is_file()] or [*folder.glob("*/vecnormalize.pkl")]
+    if len(found) > 1 and found[0] not in own:
+        names = ", ".join(map(str, sorted(found)))
         raise ValueError(f"--vecnormalize must say which belongs to {model}, found {names}")
     return found[0] if found else None
 
@@ -114,12 +104,11 @@ def _load_model(path: Path) -> SACFlow:
         raise ValueError(f"MODEL must be a file that exists, got {path}")
     if not zipfile.is_zipfile(path):
         return SACFlow.load_safe(path, device="cpu")
-    nothing: Any = object()
+    no_buffer: Any = object()
     try:
-        # A replay buffer is not wanted, and could not be built without the environment for HER.
-        model = SACFlow.load(path, device="cpu", replay_buffer=nothing)
-    # What a pickle of someone's making raises, nobody knows.
-    except Exception as error:
+        # Keeps SB3 from building a buffer, which HER cannot do without an environment.
+        model = SACFlow.load(path, device="cpu", replay_buffer=no_buffer)
+    except Exception as error:  # pickles can raise anything
         raise ValueError(
             f"MODEL must be a model that SACFlow or SAC saved, got {path} "
             f"({type(error).__name__}: {error})"
@@ -129,12 +118,12 @@ def _load_model(path: Path) -> SACFlow:
 
 
 def _load_statistics(path: Path) -> VecNormalize:
-    if not path.is_file():
-        raise ValueError(f"--vecnormalize must be a file that exists, got {path}")
     try:
-        with open(path, "rb") as file:
+        with path.open("rb") as file:
             found = pickle.load(file)
-    except Exception as error:
+    except FileNotFoundError:
+        raise ValueError(f"--vecnormalize must be a file that exists, got {path}") from None
+    except Exception as error:  # pickles can raise anything
         raise ValueError(
             f"--vecnormalize must be what VecNormalize.save wrote, got {path} "
             f"({type(error).__name__}: {error})"

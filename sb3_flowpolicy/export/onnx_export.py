@@ -1,32 +1,29 @@
-"""Policies as ONNX files, with everything that acts between sensor and motor."""
+"""Export a policy to ONNX, including observation normalization and action scaling."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import logging
-import os
-import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
-import sb3_flowpolicy
-from sb3_flowpolicy.bundle.normalization import Normalization, normalization_of
+from sb3_flowpolicy.bundle.model import made_with
+from sb3_flowpolicy.bundle.normalization import normalization_of
+from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.export.deployed import DeployedPolicy, expected_actions, random_inputs
 from sb3_flowpolicy.policies import DistributionPolicy, FlowActor
 
 FORMAT = "sb3_flowpolicy.onnx.1"
-#: The greatest difference to ``predict`` that is let pass, relative to the actions' range.
+#: Largest accepted difference to ``predict``, relative to the range of the actions.
 TOLERANCE = 1e-5
 _N_CHECKED = 64
 
@@ -41,16 +38,16 @@ def export_onnx(
     """Write a policy as an ONNX file that needs neither torch nor this package to run.
 
     The graph takes raw observations of the environment and returns actions in its units, both
-    with a leading batch axis: normalisation and clipping of ``VecNormalize``, the policy, tanh and
-    rescaling are inside. The file is run once with onnxruntime, and compared with ``predict``,
-    before it gets its name.
+    with a leading batch axis: normalization and clipping of ``VecNormalize``, the policy, tanh and
+    rescaling are included. Before the file is written, onnxruntime runs it, and its actions are
+    compared with those of ``predict``.
 
     Args:
         model: ``SACFlow``, or SB3's ``SAC`` with one of our policies.
-        path: File to write, ``.onnx`` where it has no suffix.
-        stochastic: Whether the file can also sample: noise is then a further input ``noise`` of
-            independent standard normals, (batch, M), and ``sampled_action`` a further output.
-        vec_normalize: Statistics to build in. Default: those of the model's environment, or of
+        path: File to write, ``.onnx`` if it has no suffix.
+        stochastic: Whether to sample as well: with a further input ``noise`` of independent
+            standard normals, (batch, M), and a further output ``sampled_action``.
+        vec_normalize: Statistics to include. Default: those of the model's environment, or of
             the bundle that it was loaded from.
 
     Returns:
@@ -60,7 +57,7 @@ def export_onnx(
         ValueError: If the policy is not one of ours, explores with gSDE, or has another
             ``deterministic_mode`` than ``"base"``.
         ModuleNotFoundError: If the extra ``[export]`` is not installed.
-        RuntimeError: If the file's actions are not the model's.
+        RuntimeError: If the file's actions differ from the model's.
 
     Example:
         >>> import tempfile
@@ -76,10 +73,10 @@ def export_onnx(
     """
     policy = model.policy
     if not isinstance(policy, DistributionPolicy) or not isinstance(policy.actor, FlowActor):
+        actor = type(getattr(policy, "actor", None)).__name__
         raise ValueError(
             "model must have a policy of sb3_flowpolicy with use_sde=False, got "
-            f"{type(policy).__name__} with an actor of type "
-            f"{type(getattr(policy, 'actor', None)).__name__}"
+            f"{type(policy).__name__} with an actor of type {actor}"
         )
     if policy.deterministic_mode != "base":
         raise ValueError(
@@ -88,22 +85,19 @@ def export_onnx(
         )
     normalization = normalization_of(model, vec_normalize)
     deployed = DeployedPolicy(policy, normalization, stochastic).cpu().eval()
-    names = [*deployed.input_names(), *deployed.output_names()]
+    names = [*deployed.inputs, *deployed.outputs]
     if len(set(names)) < len(names):
         raise ValueError(f"observation_space must have keys other than {names[-3:]}, got {names}")
     inputs = random_inputs(policy, stochastic, _N_CHECKED, np.random.default_rng(0))
     proto = _translate(deployed, [th.from_numpy(array[:2]) for array in inputs])
-    _describe(proto, model, normalization, stochastic)
+    _add_metadata(proto, model, normalization is not None, stochastic)
     content = proto.SerializeToString()
-    _check(content, deployed, inputs, expected_actions(policy, normalization, inputs))
+    _check(content, deployed, inputs, expected_actions(policy, normalization, stochastic, inputs))
     path = Path(path)
     path = path if path.suffix else path.with_suffix(".onnx")
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-    os.chmod(temporary, 0o644)  # mkstemp's files are for their owner alone
-    os.replace(temporary, path)
+    with replacing(path) as draft:
+        draft.write_bytes(content)
     return path
 
 
@@ -113,16 +107,16 @@ def _translate(deployed: DeployedPolicy, example: list[th.Tensor]) -> Any:
         program = th.onnx.export(
             deployed,
             tuple(example),
-            input_names=deployed.input_names(),
-            output_names=deployed.output_names(),
+            input_names=deployed.inputs,
+            output_names=deployed.outputs,
             dynamic_shapes={"inputs": tuple({0: batch} for _ in example)},
             dynamo=True,
             external_data=False,
-            verbose=False,
+            verbose=False,  # prints its progress
         )
     assert program is not None
     proto = program.model_proto
-    # Where the exporter found each operation: paths of this machine, and half of the file.
+    # Remove the source of each operation: paths of this machine, and half of the file.
     graph = proto.graph
     for part in (*graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
         part.ClearField("metadata_props")
@@ -133,8 +127,8 @@ def _translate(deployed: DeployedPolicy, example: list[th.Tensor]) -> Any:
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Keep the exporter's progress and its remarks on torch's own code to itself."""
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+    """Silence the exporter's warnings about torch's own code and missing packages."""
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logger = logging.getLogger("torch.onnx")
         level = logger.level
@@ -145,10 +139,8 @@ def _quietly() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _describe(
-    proto: Any, model: SAC, normalization: Normalization | None, stochastic: bool
-) -> None:
-    """Write into the file what somebody who has only the file needs to know."""
+def _add_metadata(proto: Any, model: SAC, normalized: bool, stochastic: bool) -> None:
+    """Describe inputs, outputs and origin for users who have only the file."""
     policy: Any = model.policy
     facts: dict[str, Any] = {
         "format": FORMAT,
@@ -157,18 +149,14 @@ def _describe(
         "num_timesteps": model.num_timesteps,
         "observation_space": describe_space(model.observation_space),
         "action_space": describe_space(model.action_space),
-        "vec_normalize": "inside" if normalization is not None else "none",
-        "made_with": {
-            "sb3_flowpolicy": sb3_flowpolicy.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-            "torch": str(th.__version__),
-        },
+        "vec_normalize": "inside" if normalized else "none",
+        "made_with": made_with(),
     }
     if stochastic:
         facts["noise"] = {
             "input": "noise",
             "shape": ["batch", policy.actor.density.noise_dim],
-            "draw": "independent standard normals, anew for each action",
+            "draw": "independent standard normals, new ones for each action",
         }
     for key, value in facts.items():
         entry = proto.metadata_props.add()
@@ -176,7 +164,7 @@ def _describe(
 
 
 def describe_space(space: spaces.Space) -> dict[str, Any]:
-    """Say in JSON what a space is; bounds that are all the same, as one number.
+    """Describe a space in JSON; bounds that are all equal become one number.
 
     Example:
         >>> describe_space(spaces.Box(-1, 1, (2,)))
@@ -192,11 +180,8 @@ def describe_space(space: spaces.Space) -> dict[str, Any]:
     }
     if isinstance(space, spaces.Box):
         facts.update(low=_bounds(space.low), high=_bounds(space.high))
-    elif isinstance(space, spaces.Discrete):
-        facts["n"] = int(space.n)
-    elif isinstance(space, spaces.MultiDiscrete):
-        facts["nvec"] = space.nvec.tolist()
-    return facts
+    sizes = {"n", "nvec"} & vars(space).keys()
+    return {**facts, **{name: np.asarray(getattr(space, name)).tolist() for name in sizes}}
 
 
 def _bounds(bounds: np.ndarray) -> Any:
@@ -212,23 +197,19 @@ def _check(
     inputs: list[np.ndarray],
     expected: list[np.ndarray],
 ) -> None:
-    """Run the file, at more than one batch size.
-
-    Raises:
-        RuntimeError: If it does not do what the model does.
-    """
+    """Raise ``RuntimeError`` if the file's actions differ, at several batch sizes."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     span = deployed.get_buffer("span").numpy().max()
     for n in (1, len(inputs[0])):
-        feed = dict(zip(deployed.input_names(), (array[:n] for array in inputs), strict=True))
+        feed = dict(zip(deployed.inputs, (array[:n] for array in inputs), strict=True))
         for name, got, wanted in zip(
-            deployed.output_names(), session.run(None, feed), expected, strict=True
+            deployed.outputs, session.run(None, feed), expected, strict=True
         ):
             gap = np.abs(got - wanted[:n]).max()
             if not gap <= TOLERANCE * max(1.0, span):
                 raise RuntimeError(
-                    f"{name} of the ONNX file must be the model's to {TOLERANCE:g} of the "
+                    f"{name} of the ONNX file must equal the model's to {TOLERANCE:g} of the "
                     f"actions' range, got a difference of {gap:.3g}"
                 )

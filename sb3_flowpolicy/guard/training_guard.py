@@ -167,9 +167,7 @@ class TrainingGuard:
         if restored is not None:
             message += f"Weights and optimizers are back at update {restored}. "
         if self.resume_from is not None:
-            message += (
-                f"resume({str(self.resume_from)!r}, env) continues from a checkpoint. "
-            )
+            message += f"resume({str(self.resume_from)!r}, env) continues from a checkpoint. "
         message += "Look for extreme rewards and observations, or lower the learning rate"
         raise NonFiniteError(
             message, name, value, model.num_timesteps, update, seed, summary, restored

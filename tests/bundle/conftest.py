@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import safetensors.numpy
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.bundle.container import write_container
+from sb3_flowpolicy.bundle.container import (
+    canonical,
+    checksum,
+    read_container,
+    write_container,
+)
 
 FAST: dict[str, Any] = {
     "learning_starts": 10,
@@ -47,7 +52,7 @@ def behind_statistics(**kwargs: Any) -> VecNormalize:
 
 @pytest.fixture(scope="session")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model of every kind of part: statistics, a schedule, moments, a learned temperature."""
+    """A model of every kind of part: statistics, moments, a learned entropy coefficient."""
     env = behind_statistics(clip_obs=float("inf"))
     model = make_model(env=env, policy_kwargs={**NET, "distribution_kwargs": UNUSUAL["realnvp"]})
     return model.learn(40).save_safe(tmp_path_factory.mktemp("bundle") / "model")
@@ -57,29 +62,41 @@ def parts_of(content: bytes) -> tuple[dict[str, Any], Any, bytes]:
     """Return header, configuration and data of a bundle, without checking anything."""
     length = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + length])
-    return header, json.loads(header["__metadata__"]["config"]), content[8 + length :]
+    config = json.loads(header["__metadata__"]["sb3_flowpolicy"])["config"]
+    return header, config, content[8 + length :]
 
 
 def sealed(header: dict[str, Any], config: Any, data: bytes) -> bytes:
-    """Put a bundle together again, with a checksum that holds."""
-    text = config if isinstance(config, str) else dumps(config, sort_keys=True)
-    header = {**header, "__metadata__": {**header["__metadata__"], "config": text}}
-    header["__metadata__"]["checksum"] = "0" * 64
-    raw = dumps(header).encode()
+    """Assemble a bundle with a valid checksum, if its arrays and configuration can have one."""
+    text = config if isinstance(config, str) else json.dumps(config)
+    try:
+        arrays = safetensors.numpy.load(assembled({**header, "__metadata__": {}}, data))
+        digest = checksum(json.loads(text), arrays)
+    except Exception:  # spoiled beyond that
+        digest = "0" * 64
+    entry = f'{{"config":{text},"sha256":"{digest}"}}'
+    return assembled(
+        {**header, "__metadata__": {**header["__metadata__"], "sb3_flowpolicy": entry}}, data
+    )
+
+
+def assembled(header: dict[str, Any], data: bytes) -> bytes:
+    raw = json.dumps(header).encode()
     raw += b" " * (-len(raw) % 8)
-    start = len(raw).to_bytes(8, "little")
-    digest = hashlib.sha256(start + raw + data).hexdigest().encode()
-    return start + raw.replace(b"0" * 64, digest, 1) + data
+    return len(raw).to_bytes(8, "little") + raw + data
 
 
-def dumps(value: Any, **kwargs: Any) -> str:
-    return json.dumps(value, separators=(",", ":"), **kwargs)
+def content_of(path: Path) -> tuple[str, dict[str, tuple]]:
+    """Return what a bundle holds, apart from the versions that it was made with."""
+    config, arrays = read_container(path)
+    config.pop("made_with", None)
+    values = {name: (one.dtype, one.shape, one.tobytes()) for name, one in arrays.items()}
+    return canonical(config), values
 
 
 @pytest.fixture
 def tampered(bundle: Path, tmp_path: Path) -> Callable[[Callable[[Any, dict], None]], Path]:
     """Return a function that writes a bundle whose configuration or arrays were changed."""
-    from sb3_flowpolicy.bundle.container import read_container
 
     def tamper(change: Callable[[Any, dict], None]) -> Path:
         config, arrays = read_container(bundle)

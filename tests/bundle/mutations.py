@@ -1,14 +1,15 @@
-"""Ways to spoil a bundle: by chance, and by somebody who knows the format."""
+"""Ways to spoil a bundle: at random, and with knowledge of the format."""
 
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from tests.bundle.conftest import dumps, parts_of, sealed
+from tests.bundle.conftest import assembled, parts_of, sealed
 
 Rng = np.random.Generator
 HOSTILE: list[Any] = [
@@ -22,7 +23,7 @@ HOSTILE: list[Any] = [
 
 
 def places(tree: Any, where: tuple = ()) -> list[tuple]:
-    """All keys and indices in a tree of dicts and lists, as paths."""
+    """Return all keys and indices in a tree of dicts and lists, as paths."""
     found = []
     entries: Any = ()
     if isinstance(tree, dict):
@@ -60,10 +61,10 @@ def spoil_tree(tree: Any, rng: Rng) -> None:
 
 
 def by_chance(content: bytes, rng: Rng) -> bytes:
-    """What disks, networks and editors do; the checksum stays as it is."""
+    """Damage as by disks, networks and editors; the checksum stays as it is."""
     raw = bytearray(content)
     place = int(rng.integers(len(raw)))
-    # Half of it in the header, which is a small part of the file.
+    # Half of the places are in the header, which is a small part of the file.
     if rng.random() < 0.5:
         header = 8 + int.from_bytes(content[:8], "little")
         place = int(rng.integers(min(header, len(raw))))
@@ -99,17 +100,15 @@ def spoil_table(content: bytes, rng: Rng) -> bytes:
 
 
 def spoil_metadata(content: bytes, rng: Rng) -> bytes:
-    header, config, data = parts_of(content)
+    header, _, data = parts_of(content)
     spoil_tree(header["__metadata__"], rng)
-    if not {"checksum", "config"} <= set(header["__metadata__"]):
-        return content[:8] + dumps(header).encode() + data
-    return sealed(header, config, data)
+    return assembled(header, data)
 
 
 def spoil_text(content: bytes, rng: Rng) -> bytes:
-    """Say the same in other words, or something that is no JSON."""
+    """Write the same configuration differently, or something that is no JSON."""
     header, config, data = parts_of(content)
-    text = dumps(config, sort_keys=True)
+    text = json.dumps(config)
     place = int(rng.integers(len(text)))
     deep = "[" * 100_000
     some = _pick(
@@ -120,7 +119,7 @@ def spoil_text(content: bytes, rng: Rng) -> bytes:
 
 
 def spoil_data(content: bytes, rng: Rng) -> bytes:
-    """Other numbers in the arrays, with a checksum that holds."""
+    """Write other numbers into the arrays, with a valid checksum."""
     header, config, data = parts_of(content)
     raw = bytearray(data)
     place = int(rng.integers(len(raw) // 4)) * 4
@@ -130,7 +129,7 @@ def spoil_data(content: bytes, rng: Rng) -> bytes:
 
 
 def exchange_arrays(content: bytes, rng: Rng) -> bytes:
-    """Give one array's place to another."""
+    """Exchange the places of two arrays."""
     header, config, data = parts_of(content)
     names = [name for name in header if name != "__metadata__"]
     one, other = _pick(names, rng), _pick(names, rng)

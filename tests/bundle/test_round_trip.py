@@ -34,7 +34,7 @@ CASES: dict[str, Any] = {
             "n_critics": 1,
         }
     ),
-    "adamw_fixed_temperature_line": lambda: make_model(
+    "adamw_fixed_ent_coef_line": lambda: make_model(
         policy_kwargs={
             **NET,
             "optimizer_class": th.optim.AdamW,
@@ -72,7 +72,7 @@ def density(name: str) -> dict[str, Any]:
 
 
 def bits(model: SACFlow) -> dict[str, th.Tensor]:
-    """Parameters, temperature and moments."""
+    """Return parameters, the entropy coefficient and moments."""
     found = dict(model.policy.state_dict())
     for name in ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer"):
         optimizer: Any = model
@@ -80,7 +80,7 @@ def bits(model: SACFlow) -> dict[str, th.Tensor]:
             optimizer = getattr(optimizer, part)
         for index, state in (optimizer.state_dict()["state"] if optimizer else {}).items():
             found.update({f"{name}.{index}.{k}": v for k, v in state.items() if v is not None})
-    found["temperature"] = model.log_ent_coef if model.log_ent_coef is not None else th.zeros(0)
+    found["log_ent_coef"] = model.log_ent_coef if model.log_ent_coef is not None else th.zeros(0)
     return {name: th.as_tensor(value).detach().clone() for name, value in found.items()}
 
 
@@ -198,9 +198,9 @@ def dictionary_env() -> gym.Env:
 
 
 def test_an_environment_with_other_spaces_is_refused(bundle: Path) -> None:
-    with pytest.raises(ValueError, match="env must have observations of the shapes"):
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
         SACFlow.load_safe(bundle, env="MountainCarContinuous-v0")
-    with pytest.raises(ValueError, match="env must have observations of the shapes"):
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
         SACFlow.load_safe(bundle, env=dictionary_env())
     path = make_model().save_safe(bundle.with_name("plain"))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
@@ -224,7 +224,7 @@ def test_equal_models_are_equal_files(tmp_path: Path) -> None:
 
 
 def test_every_argument_of_the_constructor_is_held_or_left_out_on_purpose() -> None:
-    """A new argument has to be thought of here, and in settings.SETTINGS."""
+    """A new argument has to be thought of here, and in SACFlow.settings."""
     import inspect
 
     own = [*inspect.signature(SACFlow.__init__).parameters]
@@ -242,13 +242,13 @@ def test_every_argument_of_the_constructor_is_held_or_left_out_on_purpose() -> N
         ({"learning_rate": lambda _: 1e-3}, "learning_rate must be a number or a LinearSchedule"),
         ({"policy_kwargs": {"activation_fn": type("Mine", (th.nn.ReLU,), {})}}, "activation_fn"),
         ({"policy_kwargs": {"features_extractor_class": "mine"}}, "features_extractor_class must"),
-        ({"policy_kwargs": {"net_arch": [np.pi]}}, "net_arch must be an integer"),
-        ({"policy_kwargs": {"optimizer_kwargs": {"x": {1}}}}, r"optimizer_kwargs\['x'\] must be"),
+        ({"policy_kwargs": {"net_arch": [np.pi]}}, "net_arch must be"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"x": {1}}}}, "optimizer_kwargs must be made of"),
         ({"action_noise": "any"}, "set model.action_noise = None before saving"),
         ({"replay_buffer_class": dict}, "replay_buffer_class must be one of"),
-        ({"replay_buffer_kwargs": {"env": 1}}, r"replay_buffer_kwargs must .* got \['env'\]"),
+        ({"replay_buffer_kwargs": {"env": {1}}}, "replay_buffer_kwargs must be made of"),
         ({"policy_kwargs": {"use_sde": True}}, "use_sde must be False for a safe bundle"),
-        ({"policy_class": SACFlow}, "policy must be one of"),
+        ({"policy_class": SACFlow}, "policy_class must be one of"),
         ({"gamma": float("nan")}, "gamma must be at least 0, got nan"),
     ],
 )
@@ -266,13 +266,13 @@ def test_models_full_of_nan_are_not_shared(tmp_path: Path) -> None:
     model = make_model()
     with th.no_grad():
         next(model.actor.parameters()).fill_(float("nan"))
-    with pytest.raises(ValueError, match=r"NaN or inf in policy\.actor\.latent_pi"):
+    with pytest.raises(ValueError, match=r"NaN or infinity in policy\.actor\.latent_pi"):
         model.save_safe(tmp_path / "model")
 
 
 def test_errors_are_values_and_name_the_file(tmp_path: Path) -> None:
     with pytest.raises(
-        BundleError, match=r"nowhere must be a file that can be read, got .*No such"
+        BundleError, match=r"nowhere must be a bundle .*: not a regular file that exists"
     ):
         SACFlow.load_safe(tmp_path / "nowhere")
     assert issubclass(BundleError, ValueError)

@@ -80,9 +80,10 @@ def test_where_statistics_are_looked_for(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["safe", "nowhere.zip"], "MODEL must be a file that exists, got nowhere.zip"),
-        (["safe", "text.zip"], "text.zip must be a bundle written by save_safe, but begins with"),
+        (["safe", "text.zip"], "text.zip must be a bundle written by save_safe: a header of"),
         (["onnx", "empty.zip"], "MODEL must be a model that SACFlow or SAC saved, got empty.zip"),
         (["onnx", "stock.zip"], "model must have a policy of sb3_flowpolicy"),
+        (["safe", "stock.zip"], "policy_class must be one of"),
         (["safe", "model.zip", "--stochastic"], "--stochastic is for onnx"),
         (["safe", "model.zip", "--vecnormalize", "x"], "--vecnormalize must be a file that exists"),
         (

@@ -193,7 +193,9 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         onnx_export, "expected_actions", lambda *args: [a + 1e-3 for a in actual(*args)]
     )
-    with pytest.raises(RuntimeError, match="action of the ONNX file must be the model's to 1e-05"):
+    with pytest.raises(
+        RuntimeError, match="action of the ONNX file must equal the model's to 1e-05"
+    ):
         export_onnx(model, tmp_path / "x")
     assert not list(tmp_path.iterdir())
 

@@ -14,7 +14,7 @@ from flowpolicy_envs import FindGoal, Hold, Move, SquareEnv, TunnelEnv
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.policies import FlowPolicy, LowRankPolicy
-from sb3_flowpolicy.seeds import _overrides
+from sb3_flowpolicy.seeds.__main__ import _overrides
 from tests.fuzz.effort import fuzz
 
 ANYTHING = st.recursive(

@@ -1,4 +1,4 @@
-"""Files of someone else's making: what they say is used, or a ``ValueError`` says why not."""
+"""Untrusted files are used as they are, or a ``ValueError`` explains what is wrong with them."""
 
 from __future__ import annotations
 
