@@ -46,7 +46,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "no object": (setting("progress", 3), "TypeError: 'int' object is not subscriptable"),
     "class by path": (setting("policy.policy_class", "os.system"), r"one of .* got 'os\.system'"),
     "activation": (setting("policy.activation_fn", "exec"), "activation_fn must be one of"),
-    "unknown argument": (setting("policy.x", 1), r"policy_kwargs must be .*'x'"),
+    "unknown argument": (setting("policy.x", 1), "unexpected keyword argument 'x'"),
     "gSDE": (setting("policy.use_sde", True), "use_sde must be False"),
     "density": (setting("policy.distribution", "x"), "distribution must be one of"),
     "candidates": (
