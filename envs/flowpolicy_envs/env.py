@@ -6,7 +6,6 @@ from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from flowpolicy_envs.canvas import RENDER_FPS, RENDER_MODES, Canvas, check_render_mode
@@ -15,21 +14,10 @@ BoolArray = NDArray[np.bool_]
 Generators = Callable[[int], np.random.Generator]
 
 
-class Config(Protocol):
-    """The checked arguments of an environment."""
-
-    @property
-    def observation_space(self) -> spaces.Box:
-        """Of one agent."""
-
-    @property
-    def action_space(self) -> spaces.Box:
-        """Of one agent."""
-
-
 class Batch(Protocol):
     """The state of N agents. Each call of `step` overwrites the arrays (N, ...)."""
 
+    config: Any
     everyone: BoolArray
     observations: NDArray[np.float32]
     rewards: NDArray[np.float64]
@@ -54,8 +42,7 @@ class BatchEnv(gym.Env[np.ndarray, np.ndarray]):
     """A batch of one agent as a gymnasium environment.
 
     Args:
-        config: Its arguments.
-        batch: Its state.
+        batch: Its state and configuration.
         renderer: Draws it.
         render_mode: None, "rgb_array" or "human".
 
@@ -65,14 +52,13 @@ class BatchEnv(gym.Env[np.ndarray, np.ndarray]):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}  # noqa: RUF012
 
-    def __init__(
-        self, config: Config, batch: Batch, renderer: Canvas, render_mode: str | None
-    ) -> None:
+    def __init__(self, batch: Batch, renderer: Canvas, render_mode: str | None) -> None:
         check_render_mode(render_mode, RENDER_MODES)
         self.render_mode = render_mode
-        self.observation_space = config.observation_space
-        self.action_space = config.action_space
-        self._action_shape = config.action_space.shape
+        self.config = batch.config
+        self.observation_space = self.config.observation_space
+        self.action_space = self.config.action_space
+        self._action_shape = self.config.action_space.shape
         self._agent = batch
         self._renderer = renderer
         self._action_samples: NDArray[np.float64] | None = None

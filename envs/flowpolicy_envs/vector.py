@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flowpolicy_envs.canvas import Canvas, check_render_mode
 from flowpolicy_envs.checks import is_whole
-from flowpolicy_envs.env import Batch, BoolArray, Config
+from flowpolicy_envs.env import Batch, BoolArray
 
 StepResult = tuple[NDArray[np.float32], NDArray[np.float64], BoolArray, BoolArray, dict[str, Any]]
 
@@ -55,7 +55,8 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be None or >= 1, got {max_episode_steps}")
         check_render_mode(render_mode, ("rgb_array",))
-        config, self._agents, self._renderer = self._build(num_envs, render_size, **arguments)
+        self._agents, self._renderer = self._build(num_envs, render_size, **arguments)
+        self.config = self._agents.config
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -64,10 +65,10 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
             "render_fps": self._renderer.fps,
             "autoreset_mode": self.autoreset_mode,
         }
-        self.single_observation_space = config.observation_space
-        self.single_action_space = config.action_space
-        self.observation_space = batch_space(config.observation_space, num_envs)
-        self.action_space = batch_space(config.action_space, num_envs)
+        self.single_observation_space = self.config.observation_space
+        self.single_action_space = self.config.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self._limit = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
@@ -75,8 +76,8 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         self._generators: list[np.random.Generator | None] = [None] * num_envs
 
     @abstractmethod
-    def _build(self, count: int, size: int, **arguments: Any) -> tuple[Config, Batch, Canvas]:
-        """Build configuration, state and renderer of `count` agents."""
+    def _build(self, num_envs: int, render_size: int, **arguments: Any) -> tuple[Batch, Canvas]:
+        """Build state and renderer of `num_envs` agents."""
 
     @abstractmethod
     def _scene(self, i: int) -> tuple[Any, ...]:

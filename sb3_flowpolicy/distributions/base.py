@@ -33,7 +33,8 @@ class ActionDistribution(nn.Module, ABC):
         context_dim: Number of context features H, at least 1.
 
     Raises:
-        ValueError: If a dimension is not a positive integer.
+        ValueError: If a dimension is not a positive integer, or in the public methods if the last
+            dimension of a tensor has the wrong size.
     """
 
     #: Number of standard normals M that one sample consumes.
@@ -56,9 +57,6 @@ class ActionDistribution(nn.Module, ABC):
 
         Returns:
             The sample u, shape (..., D), and log p(u | h) in nats, shape (...).
-
-        Raises:
-            ValueError: If a last dimension has the wrong size.
         """
         _check_last_dim("context", context, self.context_dim)
         _check_last_dim("noise", noise, self.noise_dim)
@@ -73,9 +71,6 @@ class ActionDistribution(nn.Module, ABC):
 
         Returns:
             log p(u | h) in nats, shape (...).
-
-        Raises:
-            ValueError: If a last dimension has the wrong size.
         """
         _check_last_dim("context", context, self.context_dim)
         _check_last_dim("value", value, self.action_dim)
@@ -89,9 +84,6 @@ class ActionDistribution(nn.Module, ABC):
 
         Returns:
             The unsquashed action, shape (..., D).
-
-        Raises:
-            ValueError: If the last dimension has the wrong size.
         """
         _check_last_dim("context", context, self.context_dim)
         return self._mode(context)

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from sb3_flowpolicy.distributions.coupling import AffineCoupling
-from sb3_flowpolicy.distributions.coupling_flow import CouplingFlow
+from collections.abc import Sequence
+
+import torch as th
+
+from sb3_flowpolicy.distributions.base import soft_bound
+from sb3_flowpolicy.distributions.coupling import Coupling, CouplingFlow
+
+# A layer may scale a coordinate by up to e^5: far more than a policy needs, and float32 holds the
+# product over any sensible number of layers.
+LOG_SCALE_BOUND = 5.0
 
 
 class RealNVP(CouplingFlow):
@@ -31,3 +39,33 @@ class RealNVP(CouplingFlow):
 
     def _make_coupling(self, passive: int, active: int) -> AffineCoupling:
         return AffineCoupling(passive, active, self.hidden)
+
+
+class AffineCoupling(Coupling):
+    r"""Coupling that scales and shifts.
+
+    .. math:: b \mapsto b \odot \exp(s(a, h)) + t(a, h)
+
+    Args:
+        passive: Number of coordinates that are read, at least 0.
+        active: Number of coordinates that are moved, at least 1.
+        hidden: Units of the hidden layers.
+
+    References:
+        Density estimation using Real NVP (Dinh et al., 2017), eq. 7.
+    """
+
+    def __init__(self, passive: int, active: int, hidden: Sequence[int]) -> None:
+        super().__init__(passive, 2 * active, hidden)
+
+    def move(self, active: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Scale and shift."""
+        shift, log_scale = outputs.chunk(2, dim=-1)
+        log_scale = soft_bound(log_scale, LOG_SCALE_BOUND)
+        return active * log_scale.exp() + shift, log_scale
+
+    def move_back(self, moved: th.Tensor, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Undo the shift and the scaling."""
+        shift, log_scale = outputs.chunk(2, dim=-1)
+        log_scale = soft_bound(log_scale, LOG_SCALE_BOUND)
+        return (moved - shift) * (-log_scale).exp(), log_scale

@@ -10,8 +10,7 @@ import torch as th
 from torch.nn.functional import pad, softmax
 
 from sb3_flowpolicy.distributions.base import positive_int, soft_bound
-from sb3_flowpolicy.distributions.coupling import Coupling
-from sb3_flowpolicy.distributions.coupling_flow import CouplingFlow
+from sb3_flowpolicy.distributions.coupling import Coupling, CouplingFlow
 
 # A spline is the identity outside (-5, 5); tanh(5) = 0.9999 is almost the edge of the action box.
 BOUND = 5.0

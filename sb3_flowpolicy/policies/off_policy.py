@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_flowpolicy.common.validation import mapping, one_of, optional
 from sb3_flowpolicy.distributions.base import is_whole, positive_int
 from sb3_flowpolicy.guard.finite import all_finite, check_observation
 from sb3_flowpolicy.policies.actor import FlowActor
@@ -84,7 +85,9 @@ class DistributionPolicy(BasePolicy):
         check_observation_space(observation_space, extractor)
         # Plain attributes before super().__init__(), which builds the actor.
         self.distribution = self.default_distribution if distribution is None else distribution
-        self.distribution_kwargs = checked_distribution_kwargs(distribution_kwargs)
+        self.distribution_kwargs = dict(
+            optional(mapping)("distribution_kwargs", distribution_kwargs) or {}
+        )
         self._uses_sde = bool(policy_kwargs.get("use_sde"))
         if self._uses_sde and self.distribution != "gaussian":
             raise ValueError(
@@ -116,8 +119,7 @@ class DistributionPolicy(BasePolicy):
 
     @deterministic_mode.setter
     def deterministic_mode(self, mode: str) -> None:
-        if mode not in MODES:
-            raise ValueError(f"deterministic_mode must be one of {MODES}, got {mode!r}")
+        one_of(*MODES)("deterministic_mode", mode)
         if mode != "base" and self._uses_sde:
             raise ValueError(f'deterministic_mode must be "base" with use_sde=True, got {mode!r}')
         self._deterministic_mode = mode
@@ -163,14 +165,6 @@ class DistributionPolicy(BasePolicy):
             # SB3 omits it: a policy that shares its extractor would be loaded as one that does not.
             "share_features_extractor": self.share_features_extractor,
         }
-
-
-def checked_distribution_kwargs(kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the arguments of a density, or raise ``ValueError`` if they are not a dict."""
-    kwargs = {} if kwargs is None else kwargs
-    if not isinstance(kwargs, Mapping) or not all(isinstance(name, str) for name in kwargs):
-        raise ValueError(f"distribution_kwargs must be a dict with strings as keys, got {kwargs!r}")
-    return dict(kwargs)
 
 
 def check_net_arch(net_arch: Any, critic: str, both: bool) -> None:

@@ -14,13 +14,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_flowpolicy.common.validation import mapping, optional
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
 from sb3_flowpolicy.policies.extractors import check_observation_space, with_forms
-from sb3_flowpolicy.policies.off_policy import (
-    check_finite_actions,
-    check_net_arch,
-    checked_distribution_kwargs,
-)
+from sb3_flowpolicy.policies.off_policy import check_finite_actions, check_net_arch
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # Arguments of SB3's Gaussian head, which is not built.
@@ -95,7 +92,9 @@ class DensityActorCritic(ActorCriticPolicy):
         check_observation_space(observation_space, extractor)
         # Plain attributes before super().__init__(), which builds the networks.
         self.distribution = self.default_distribution if distribution is None else distribution
-        self.distribution_kwargs = checked_distribution_kwargs(distribution_kwargs)
+        self.distribution_kwargs = dict(
+            optional(mapping)("distribution_kwargs", distribution_kwargs) or {}
+        )
         self._squashes = squash_output
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
         # SB3's constructor accepts squash_output with gSDE only, but the rest of SB3 supports it.

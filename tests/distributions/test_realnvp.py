@@ -13,7 +13,8 @@ from zuko.flows.coupling import GeneralCouplingTransform
 from zuko.transforms import MonotonicAffineTransform
 
 from sb3_flowpolicy.distributions import RealNVP
-from sb3_flowpolicy.distributions.coupling import LOG_SCALE_BOUND, split_order
+from sb3_flowpolicy.distributions.coupling import split_order
+from sb3_flowpolicy.distributions.realnvp import LOG_SCALE_BOUND
 from tests.distributions.conftest import CONTEXT_DIM, build
 
 

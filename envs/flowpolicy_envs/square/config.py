@@ -147,7 +147,7 @@ class SquareConfig:
         if self.dt * high["max_force"] * mobility > low["max_speed"]:
             raise ValueError(
                 "dt * max_force * (1 / mass + (size / 2)**2 / inertia) must be at most max_speed, "
-                f"or fingers would overtake themselves: got {high['max_force'] * self.dt:.3g} * "
+                f"or contact would be faster than fingers, got {high['max_force'] * self.dt:.3g} * "
                 f"{mobility:.3g} > {low['max_speed']:.3g}"
             )
 

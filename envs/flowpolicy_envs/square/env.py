@@ -165,9 +165,9 @@ class SquareEnv(BatchEnv):
         render_size: int = 600,
         **arguments: Any,
     ) -> None:
-        self.config = SquareConfig(task, **arguments)
-        self._batch = SquareBatch(self.config, count=1)
-        super().__init__(self.config, self._batch, Renderer(self.config, render_size), render_mode)
+        config = SquareConfig(task, **arguments)
+        self._batch = SquareBatch(config, count=1)
+        super().__init__(self._batch, Renderer(config, render_size), render_mode)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of everything that determines the future.

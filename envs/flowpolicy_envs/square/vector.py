@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowpolicy_envs.env import Batch, Config
+from flowpolicy_envs.env import Batch
 from flowpolicy_envs.square.batch import SquareBatch
 from flowpolicy_envs.square.config import SquareConfig
 from flowpolicy_envs.square.rendering import Renderer
@@ -27,10 +27,10 @@ class SquareVectorEnv(BatchVectorEnv):
         ((3, 42), ['timeout', 'timeout', 'timeout'])
     """
 
-    def _build(self, count: int, size: int, **arguments: Any) -> tuple[Config, Batch, Renderer]:
-        self.config = SquareConfig(**arguments)
-        self._batch = SquareBatch(self.config, count)
-        return self.config, self._batch, Renderer(self.config, size)
+    def _build(self, num_envs: int, render_size: int, **arguments: Any) -> tuple[Batch, Renderer]:
+        config = SquareConfig(**arguments)
+        self._batch = SquareBatch(config, num_envs)
+        return self._batch, Renderer(config, render_size)
 
     @property
     def bodies(self) -> NDArray[np.float64]:

@@ -38,7 +38,7 @@ class TunnelBatch:
 
     def __init__(self, config: TunnelConfig, count: int) -> None:
         geometry = config.geometry
-        self._config = config
+        self.config = config
         self.everyone = np.ones(count, dtype=np.bool_)
         self.positions = np.zeros((count, geometry.dims))
         self.observations = np.zeros((count, *config.observation_space.shape), np.float32)
@@ -76,9 +76,9 @@ class TunnelBatch:
             chosen: Which agents, boolean of shape (N,).
             generators: Function from the index of an agent to its random generator.
         """
-        if self._config.start_noise > 0.0:
+        if self.config.start_noise > 0.0:
             for n in np.flatnonzero(chosen).tolist():
-                self._arcs[n] = self._config.draw_start(generators(n))
+                self._arcs[n] = self.config.draw_start(generators(n))
         self._place(chosen)
 
     def _place(self, chosen: NDArray[np.bool_]) -> None:

@@ -135,9 +135,9 @@ class TunnelEnv(BatchEnv):
         render_size: int = 600,
         **arguments: Any,
     ) -> None:
-        self.config = TunnelConfig(path, **arguments)
-        self._batch = TunnelBatch(self.config, count=1)
-        super().__init__(self.config, self._batch, Renderer(self.config, render_size), render_mode)
+        config = TunnelConfig(path, **arguments)
+        self._batch = TunnelBatch(config, count=1)
+        super().__init__(self._batch, Renderer(config, render_size), render_mode)
         self._trail: list[NDArray[np.float64]] = []
 
     @property

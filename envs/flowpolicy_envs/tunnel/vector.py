@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowpolicy_envs.env import Batch, Config
+from flowpolicy_envs.env import Batch
 from flowpolicy_envs.tunnel.batch import TunnelBatch
 from flowpolicy_envs.tunnel.config import TunnelConfig
 from flowpolicy_envs.tunnel.rendering import Renderer
@@ -28,10 +28,10 @@ class TunnelVectorEnv(BatchVectorEnv):
         ([0.0, -0.1, 0.0], [False, True, False])
     """
 
-    def _build(self, count: int, size: int, **arguments: Any) -> tuple[Config, Batch, Renderer]:
-        self.config = TunnelConfig(**arguments)
-        self._batch = TunnelBatch(self.config, count)
-        return self.config, self._batch, Renderer(self.config, size)
+    def _build(self, num_envs: int, render_size: int, **arguments: Any) -> tuple[Batch, Renderer]:
+        config = TunnelConfig(**arguments)
+        self._batch = TunnelBatch(config, num_envs)
+        return self._batch, Renderer(config, render_size)
 
     @property
     def positions(self) -> NDArray[np.float64]:
