@@ -24,7 +24,7 @@ from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
 from sb3_flowpolicy.benchmarks.updates import Unmoved
 from sb3_flowpolicy.guard.training_guard import UPDATES_BETWEEN_LOOKS, TrainingGuard
 from sb3_flowpolicy.policies.deterministic import MODES
-from sb3_flowpolicy.seeds import batch as seed_batch
+from sb3_flowpolicy.seeds import experience
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
 CHUNK, QUICK_CHUNK = 1000, 10
@@ -89,7 +89,7 @@ class _Turns:
         with (
             mock.patch.object(self.models, "_guard", _NoGuard()),
             mock.patch.object(off_policy, "check_step", _accept),
-            mock.patch.object(seed_batch, "check_experience", _accept),
+            mock.patch.object(experience, "check_experience", _accept),
         ):
             return self.guarded()
 
@@ -159,7 +159,7 @@ def _time_calls(turns: _Turns) -> dict[str, list[float]]:
 
     with (
         timed(off_policy, "check_step"),
-        timed(seed_batch, "check_experience"),
+        timed(experience, "check_experience"),
         timed(TrainingGuard, "before_updates"),
         timed(TrainingGuard, "after_updates"),
         timed(TrainingGuard, "look"),

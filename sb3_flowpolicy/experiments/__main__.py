@@ -8,24 +8,24 @@ import shutil
 import sys
 from pathlib import Path
 
-from sb3_flowpolicy.experiments.costs import in_words, plan_seconds
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
 from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
-from sb3_flowpolicy.experiments.shared_items import adopt
+from sb3_flowpolicy.experiments.runner import adopt, results_folder, run_local, unfinished
 from sb3_flowpolicy.experiments.work import (
     FIRST_SEED,
     QUICK_SEEDS,
     QUICK_STEPS,
     SEEDS_PER_ITEM,
+    in_words,
     make_plan,
+    plan_seconds,
 )
 
 OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Do what the command line says.
+    """Run the command.
 
     Args:
         arguments: Command line without the program's name. Default: that of the process.
@@ -37,11 +37,13 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         args.command(args)
     except KeyboardInterrupt:
-        print("\nInterrupted. The same command goes on from the last checkpoint.", file=sys.stderr)
+        print(
+            "\nInterrupted. The same command continues from the last checkpoint.", file=sys.stderr
+        )
         return 130
     except OSError as error:
         advice = (
-            ". What is finished is kept; once this is mended, the same command goes on from the "
+            ". Finished items are kept; once this is fixed, the same command continues from the "
             "last checkpoint"
         )
         print(f"error: {error}{advice if args.command is _run else ''}", file=sys.stderr)
@@ -77,7 +79,7 @@ def _run(args: argparse.Namespace) -> None:
     experiment = find(args.name)
     missing = what_is_missing(experiment)
     if missing:
-        raise ValueError(f"{experiment.name} needs {missing}, which is not here")
+        raise ValueError(f"{experiment.name} needs {missing}, which is not installed")
     if args.workers < 1:
         raise ValueError(f"--workers must be at least 1, got {args.workers}")
     if args.address is not None and args.backend != "ray":
@@ -113,8 +115,7 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    from sb3_flowpolicy.experiments.markdown import write_docs
-    from sb3_flowpolicy.experiments.report import write_report
+    from sb3_flowpolicy.experiments.report import write_docs, write_report
 
     if args.html is not None and args.html.is_dir():
         raise ValueError(f"--html must be a file, got the folder {args.html}")
@@ -125,7 +126,7 @@ def _report(args: argparse.Namespace) -> None:
 
 
 class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Shows defaults, except of arguments that say themselves what None stands for."""
+    """Shows defaults, except None, which the help texts explain themselves."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         return action.help if action.default is None else super()._get_help_string(action)
@@ -135,13 +136,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.experiments",
         description="The findings of the thesis, each by one command: `list` shows them, `run` "
-        "trains the agents, `report` draws and judges what was measured.",
+        "trains the agents, `report` draws and judges the results.",
     )
     commands = parser.add_subparsers(required=True, metavar="list|run|report")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     for name, function, text in (
-        ("list", _list, "show all experiments, what they cost and whether they can run here"),
-        ("run", _run, "run one experiment, or go on with it after an interruption"),
+        ("list", _list, "show all experiments, their cost and whether they can run here"),
+        ("run", _run, "run one experiment, or continue it after an interruption"),
         ("report", _report, "write one HTML page from all results, and the tables for the docs"),
     ):
         command = commands.add_parser(
@@ -181,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
                 "--profile",
                 choices=("full", "quick"),
                 default="full",
-                help="quick: two seeds and few steps, to see that everything works",
+                help="quick: two seeds and few steps, to check that everything works",
             )
             add("--workers", type=int, default=cores, help="processes at a time, one core each")
         if name == "report":

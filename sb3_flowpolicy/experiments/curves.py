@@ -20,12 +20,12 @@ def common_grid(steps: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def on_grid(grid: np.ndarray, steps: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate a log linearly; before its first value it is taken to be constant.
+    """Interpolate a log linearly; before its first value it is constant.
 
     Args:
-        grid: Where values are wanted, (T,).
-        steps: Where values were measured, increasing.
-        values: What was measured; NaN where nothing was, but not everywhere.
+        grid: Steps of the result, (T,).
+        steps: Steps of the measurements, increasing.
+        values: Measurements; NaN where there is none, but not everywhere.
 
     Returns:
         Values at the grid, (T,).

@@ -1,17 +1,17 @@
-"""``python -m sb3_flowpolicy.experiments.deterministic``: what is the base mean of a flow worth?"""
+"""``python -m sb3_flowpolicy.experiments.deterministic``: ways of acting deterministically."""
 
 from __future__ import annotations
 
 import argparse
 import csv
 from collections.abc import Sequence
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import torch as th
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.experiments.measures import DeterministicEpisodes, own_random_numbers
 from sb3_flowpolicy.policies.deterministic import MODES
@@ -27,12 +27,12 @@ def compare(
     """Train ``sac_flow`` and test each agent in each way of acting.
 
     Args:
-        env: Environment that tells of success.
+        env: Environment that reports success.
         seeds: Seeds of the agents.
         steps: Steps per agent.
         every: Steps between two tests.
         episodes: Episodes per test.
-        **overrides: Instead of those of the hyperparameter file.
+        **overrides: Override the hyperparameter file.
 
     Returns:
         One row per test, agent and way, see ``COLUMNS``.
@@ -66,11 +66,7 @@ def _print(env: str, step: int, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Compare the ways on the environments that the command line names.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-    """
+    """Compare the ways on the environments of the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.experiments.deterministic",
         description="Train sac_flow and test it in four ways: the base mean, the best of 64 "
@@ -91,13 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for env in args.envs:
         rows += compare(env, args.seeds, args.steps, args.every, args.episodes, ent_coef=ent_coef)
         if args.csv is not None:
-            text = StringIO()
-            writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-            draft = args.csv.with_suffix(".tmp")
-            draft.write_text(text.getvalue())
-            draft.replace(args.csv)
+            with replacing(args.csv) as draft, draft.open("w", newline="") as file:
+                writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
 
 
 if __name__ == "__main__":

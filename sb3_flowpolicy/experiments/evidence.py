@@ -1,4 +1,4 @@
-"""What was measured, in the words that rules and tables use."""
+"""Results of an experiment, in the terms that rules and tables use."""
 
 from __future__ import annotations
 
@@ -10,10 +10,17 @@ from typing import Any
 import numpy as np
 
 from sb3_flowpolicy.experiments.curves import common_grid, on_grid, running_mean, swings
-from sb3_flowpolicy.experiments.experiment import Experiment, NotMeasuredError
-from sb3_flowpolicy.experiments.integrity import rows_of_seeds
-from sb3_flowpolicy.experiments.settings_file import read_settings
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row
+from sb3_flowpolicy.experiments.experiment import (
+    NOT_MEASURED,
+    NOT_REPRODUCED,
+    PARTLY,
+    REPRODUCED,
+    Check,
+    Experiment,
+    Finding,
+    NotMeasuredError,
+)
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row, read_settings
 
 # The share of evaluations, at the end of training, that "final" refers to, and the least number.
 FINAL_SHARE, FINAL_LEAST = 0.1, 3
@@ -21,11 +28,11 @@ FINAL_SHARE, FINAL_LEAST = 0.1, 3
 SOLVED = 0.8
 # Three times 0.8, summed and divided by three, is a little less than 0.8.
 _ROUNDING = 1e-9
-# Evaluations in a row that have to show it, for "at its best" and for "steps until solved".
+# Consecutive evaluations that count for "at its best" and for "steps until solved".
 IN_A_ROW = 3
 
 OSCILLATIONS = {"train_return": 0.25, "entropy": 1.0, "log_ent_coef": 0.1}
-"""What counts as a swing: a quarter of the best test return, a nat, a tenth of the temperature."""
+"""What counts as a swing: a quarter of the best test return, a nat, a tenth of the coefficient."""
 SWINGS_OF_AN_OSCILLATION = 3
 """Up, down, up and down again, or the reverse: a single overshoot is no oscillation."""
 
@@ -35,8 +42,8 @@ class Evidence:
 
     Args:
         experiment: The experiment.
-        folder: Its folder; items that are missing there are simply absent.
-        others: Looks up the evidence of another experiment, None if there is none.
+        folder: Its folder, complete or not.
+        others: Returns the evidence of another experiment by name, None if there is none.
 
     Raises:
         ValueError: If a file is corrupt, or rows of a finished item are missing.
@@ -54,9 +61,28 @@ class Evidence:
         self.files = {key: ItemFiles(folder, key) for key in self.items}
         self.done = {key: files.read_done() for key, files in self.files.items()}
 
+    def judge(self) -> tuple[str, list[Finding]]:
+        """Apply the experiment's rule; return the verdict and the result of each check."""
+        checks = self.experiment.checks
+        if not self.complete:
+            return NOT_MEASURED, [Finding(None, "runs are missing") for _ in checks]
+        findings = [self._test(check) for check in checks]
+        held = [finding.holds for finding in findings]
+        if None in held:
+            return NOT_MEASURED, findings
+        if all(held):
+            return REPRODUCED, findings
+        return (PARTLY if any(held) else NOT_REPRODUCED), findings
+
+    def _test(self, check: Check) -> Finding:
+        try:
+            return check.test(self)
+        except NotMeasuredError as error:
+            return Finding(None, f"{error} was not measured")
+
     @property
     def complete(self) -> bool:
-        """Whether all agents are there on all settings, and finished."""
+        """Whether all agents have finished on all settings."""
         there = {(item["setting"], item["agent"]) for item in self.items.values()}
         wanted = {
             (setting.name, agent.name)
@@ -75,7 +101,7 @@ class Evidence:
         logs: dict[tuple[str, str], dict[int, list[Row]]] = {}
         for key, item in self.items.items():
             seeds = logs.setdefault((item["setting"], item["agent"]), {})
-            seeds |= rows_of_seeds(self.files[key], item, self.done[key])
+            seeds |= self.files[key].rows_of_seeds(item, self.done[key])
         return logs
 
     @cached_property
@@ -91,7 +117,7 @@ class Evidence:
         return bool(self._logs.get((setting, agent)))
 
     def columns(self, setting: str, agent: str) -> list[str]:
-        """Return what was measured of every seed of this agent."""
+        """Return the metrics that were measured for every seed of this agent."""
         logs = self._logs.get((setting, agent), {})
         if not logs:
             return []
@@ -143,7 +169,7 @@ class Evidence:
     def steps_until_solved(self, setting: str, agent: str) -> np.ndarray:
         """Return the step at which each seed first succeeds in a row of evaluations, (S,).
 
-        Those that never do count with the length of training: a lower bound.
+        Seeds that never do count with the length of training, a lower bound.
         """
         steps, values = self.curves(setting, agent, "test_success")
         reached = running_mean(values, IN_A_ROW) >= SOLVED - _ROUNDING
@@ -154,8 +180,8 @@ class Evidence:
         """Return the number of swings of each seed, the least over the three curves, (S,).
 
         Counted from the first training success on, in training return, entropy and the logarithm
-        of the temperature, each averaged over three evaluations: the thesis sees all three swing
-        together, so the curve that swings least decides.
+        of the entropy coefficient, each averaged over three evaluations. In the thesis all three
+        swing together, so the curve with the fewest swings decides.
         """
         _, success = self.curves(setting, agent, "train_success")
         counts = []
@@ -179,7 +205,7 @@ class Evidence:
         return np.any(success > 0, axis=1)
 
     def _best_test_return(self, setting: str) -> float:
-        """Return the highest test return of any agent, which the swings are measured by."""
+        """Return the highest test return of any agent, the unit of swings in return."""
         agents = [one.name for one in self.experiment.agents if self.has(setting, one.name)]
         return max(float(self.curves(setting, one, "test_return")[1].max()) for one in agents)
 

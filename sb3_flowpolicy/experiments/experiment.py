@@ -1,13 +1,10 @@
-"""What an experiment is: a claim, the runs that test it, and the rule that judges them."""
+"""An experiment: a claim, the runs that test it, and the rule that judges them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from sb3_flowpolicy.experiments.evidence import Evidence
+from typing import Any
 
 REPRODUCED, PARTLY, NOT_REPRODUCED, NOT_MEASURED = (
     "reproduced",
@@ -39,7 +36,7 @@ LOW_RANK = Agent("lowrank", "LR", "sac_lowrank")
 FLOW = Agent("flow", "NF", "sac_flow")
 FLOW_DEFAULT_INIT = Agent(
     "flow-default-init",
-    "NF, torch's initialisation",
+    "NF, torch's initialization",
     "sac_flow",
     {"policy_kwargs": {"distribution_kwargs": {"init": "default"}}},
 )
@@ -67,37 +64,37 @@ class Setting:
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found: whether it holds, None if it could not be measured, and the numbers."""
+    """Result of a check: whether it holds, None if it could not be measured, and the numbers."""
 
     holds: bool | None
     measured: str
 
 
 class NotMeasuredError(LookupError):
-    """What a check asks for is not among the results."""
+    """A check needs a measurement that is not among the results."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of an experiment's rule: a statement and how to test it."""
+    """One line of an experiment's rule: a statement, and its test on an ``Evidence``."""
 
     statement: str
-    test: Callable[[Evidence], Finding]
+    test: Callable[..., Finding]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A claim of the thesis, or one of ours, and everything needed to test it.
+    """A claim of the thesis, or a comparison of ours, and everything needed to test it.
 
     Attributes:
         name: Name in commands and folders.
         claim: Number of the claim; E1 to E11 follow the thesis, D2 and up are ours.
         source: Section and figures of the thesis; ``"ours"`` where there is nothing to reproduce.
-        title: One line that says what is compared.
-        thesis: What the thesis found, in our words.
+        title: The comparison in one line.
+        thesis: The thesis's finding, in our words.
         settings: Environments with hyperparameters.
         checks: The rule: all hold, reproduced; none, not reproduced; else partly.
-        agents: Who is compared.
+        agents: The agents that are compared.
         steps: Environment steps per seed.
         seeds: Number of seeds; they are 1, 2, ...
         eval_every: Steps between two measurements.
@@ -105,7 +102,7 @@ class Experiment:
         measures: Names of further measurements, see ``measures.py``.
         pictures_at: When to record the first seed's policy along an episode, as shares of
             ``steps``; only on two-dimensional Tunnels.
-        notes: What a reader should know about how it was set up.
+        notes: Remarks on the setup, for readers.
     """
 
     name: str
@@ -123,37 +120,3 @@ class Experiment:
     measures: tuple[str, ...] = ()
     pictures_at: tuple[float, ...] = ()
     notes: str = ""
-
-    def setting(self, name: str) -> Setting:
-        """Return the setting of that name."""
-        return next(one for one in self.settings if one.name == name)
-
-    def agent(self, name: str) -> Agent:
-        """Return the agent of that name."""
-        return next(one for one in self.agents if one.name == name)
-
-    def judge(self, evidence: Evidence) -> tuple[str, list[Finding]]:
-        """Apply the rule.
-
-        Args:
-            evidence: What was measured.
-
-        Returns:
-            The verdict and what each check found.
-        """
-        if not evidence.complete:
-            return NOT_MEASURED, [Finding(None, "runs are missing") for _ in self.checks]
-        findings = [_test(check, evidence) for check in self.checks]
-        if any(finding.holds is None for finding in findings):
-            return NOT_MEASURED, findings
-        held = [finding.holds for finding in findings]
-        if all(held):
-            return REPRODUCED, findings
-        return (PARTLY if any(held) else NOT_REPRODUCED), findings
-
-
-def _test(check: Check, evidence: Evidence) -> Finding:
-    try:
-        return check.test(evidence)
-    except NotMeasuredError as error:
-        return Finding(None, f"{error} was not measured")

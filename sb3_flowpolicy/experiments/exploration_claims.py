@@ -1,12 +1,11 @@
-"""Our own comparison: what else people would use when a diagonal Gaussian does not explore."""
+"""Experiments of ours: alternatives to a diagonal Gaussian for exploration."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
-from sb3_flowpolicy.experiments.comparisons import at_least_times, ordered
-from sb3_flowpolicy.experiments.counts import solved
+from sb3_flowpolicy.experiments.checks import at_least_times, ordered, solved
 from sb3_flowpolicy.experiments.experiment import (
     FLOW,
     GAUSS,
@@ -49,8 +48,8 @@ EXPLORERS = (
     SPLINE_PINK,
 )
 
-# In eight dimensions a tunnel that couples all of them is one that nobody gets into
-# (diagonal-dimensions), so two are coupled and the six others are the policy's to waste.
+# No agent learns a tunnel that couples all of eight dimensions (diagonal-dimensions), so two are
+# coupled and the six others are unconstrained.
 _TUNNELS = {
     "2-dimensions": {"total_dims": 2, "coupled_dims": 2},
     "8-dimensions": {"total_dims": 8, "coupled_dims": 2, "free_dims": 6},
@@ -66,7 +65,7 @@ EXPLORATION_CLAIMS = (
         name="exploration-benchmark",
         claim="X1",
         source="ours",
-        title="The diagonal tunnel for every way to explore: densities, gSDE, coloured noise",
+        title="The diagonal tunnel with all densities, gSDE and colored noise",
         thesis="Not in the thesis, which compares Gauss, LR and NF.",
         settings=tuple(
             Setting(name, "TunnelDiagonal-v0", env_kwargs=env_kwargs)
@@ -78,15 +77,15 @@ EXPLORATION_CLAIMS = (
         notes="Hyperparameters are those of sparse-fixed-alpha, for every agent. gSDE keeps its "
         "noise for 8 steps and then does 8 updates, as is usual; all others update at every step. "
         "Of the eight dimensions two are coupled and six are free: 8.6 % of independent uniform "
-        "actions stay inside, as with two dimensions. With all eight coupled fewer than one in "
-        "400 000 do, and nobody gets there from four on (diagonal-dimensions). There is no claim "
-        "to reproduce: each line says whether that agent gets there.",
+        "actions stay inside, as with two dimensions. With all eight coupled fewer than one in 400 "
+        "000 do, and no agent solves four or more (diagonal-dimensions). There is no claim to "
+        "reproduce: each line states whether that agent solves the task.",
     ),
     Experiment(
         name="exploration-square",
         claim="X2",
         source="ours",
-        title="The square to move along x for every way to explore",
+        title="Moving the square along x with all densities, gSDE and colored noise",
         thesis="Not in the thesis, which compares Gauss, LR and NF.",
         settings=(Setting("move-x", "SquareMoveX-v0", overrides=_SMALLER),),
         agents=_ON_SQUARE,
@@ -98,9 +97,9 @@ EXPLORATION_CLAIMS = (
         measures=("x_std", "x_max"),
         notes="Table 3.3 as in move-x, but with critics and actors of 128 units, half as many "
         "updates, and 30 000 steps, so that a hundred agents fit into two hours on two cores. The "
-        "thesis saw its agents part only after some 1.5 million steps; here they have just learned "
-        "to hold on while they explore. There is no claim to reproduce: each line says whether "
-        "that agent moves farther, or keeps more entropy, than Gauss. gSDE has no density of its "
-        "own here, so no entropy.",
+        "agents of the thesis differ only after some 1.5 million steps; here they have just "
+        "learned to hold on while they explore. There is no claim to reproduce: each line states "
+        "whether that agent moves farther, or keeps more entropy, than Gauss. gSDE has no density "
+        "of its own here, so no entropy.",
     ),
 )

@@ -1,4 +1,4 @@
-"""Curves of an experiment as one picture, in the thesis's layout (figures 3.5, 3.7, 3.9, ...)."""
+"""Still figures: curves as in the thesis (figures 3.5, 3.7, 3.9, ...), profiles and outcomes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
+from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean, interquartile_mean
 from sb3_flowpolicy.diagnostics.figures import new_figure
 from sb3_flowpolicy.experiments.curves import running_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Those of the thesis's agents are told apart by every common kind of colour vision, and in print
-# (Okabe and Ito); ten are more than can be.
-COLOURS = {
+# The thesis's agents have colors that remain distinct in print and for color-blind readers (Okabe
+# and Ito); there are not ten such colors.
+COLORS = {
     "gauss": "#d55e00",
     "lowrank": "#009e73",
     "flow": "#0072b2",
@@ -32,18 +32,22 @@ COLOURS = {
     "spline": "#6a3d9a",
     "spline-pink": "#cab2d6",
 }
+# Color of a field whose seeds all succeed; white if none does.
+_FULL = np.array([0.0, 0.447, 0.698])
+# Fields above this share are so dark that their text has to be white.
+_DARK = 0.6
 PANELS = ("train_return", "test_return", "test_success", "entropy", "ent_coef")
 SMOOTHED_OVER = 3
 """Evaluations that a drawn point averages; numbers in tables are not smoothed."""
 
 
-def colour(agent: Agent) -> str:
-    """Return the colour of an agent in all figures."""
-    return COLOURS.get(agent.name, "#555555")
+def color(agent: Agent) -> str:
+    """Return the color of an agent in all figures."""
+    return COLORS.get(agent.name, "#555555")
 
 
 def panels(evidence: Evidence) -> list[str]:
-    """Return the metrics that are worth a panel: those measured, temperature if learned."""
+    """Return the metrics to draw: those measured, and the entropy coefficient if learned."""
     measured: set[str] = set()
     moves = False
     for setting in evidence.experiment.settings:
@@ -62,19 +66,8 @@ def curves_figure(evidence: Evidence) -> Figure:
     """Draw all curves: a row per setting, a column per metric.
 
     Every seed is a thin line, their interquartile mean a bold one, its 95 % interval a band.
-
-    Args:
-        evidence: Results, complete or not.
-
-    Returns:
-        A matplotlib figure.
-
-    Raises:
-        ValueError: If there is nothing to draw.
     """
     experiment, metrics = evidence.experiment, panels(evidence)
-    if not metrics:
-        raise ValueError(f"evidence must hold at least one measurement, got {evidence.folder}")
     rows = len(experiment.settings)
     figure = new_figure(3.3 * len(metrics), 2.5 * rows + 0.4)
     grid = figure.subplots(rows, len(metrics), squeeze=False)
@@ -82,8 +75,10 @@ def curves_figure(evidence: Evidence) -> Figure:
         for axes, metric in zip(row, metrics, strict=True):
             for agent in experiment.agents:
                 if metric in evidence.columns(setting.name, agent.name):
-                    _draw(axes, evidence, setting.name, agent, metric)
-            _dress(axes, metric)
+                    steps, values = evidence.curves(setting.name, agent.name, metric)
+                    _draw(axes, agent, steps, smoothed(values))
+            _style(axes)
+            _scale(axes, metric)
             if k == rows - 1:
                 axes.set_xlabel("environment steps", fontsize=8)
             if k == 0:
@@ -100,20 +95,21 @@ def smoothed(values: np.ndarray) -> np.ndarray:
     return running_mean(values, SMOOTHED_OVER)
 
 
-def _draw(axes: Axes, evidence: Evidence, setting: str, agent: Agent, metric: str) -> None:
-    steps, values = evidence.curves(setting, agent.name, metric)
-    values = smoothed(values)
-    shade = colour(agent)
-    axes.plot(steps, values.T, color=shade, linewidth=0.5, alpha=0.35)
-    mean = bootstrap_interquartile_mean(values)
-    axes.fill_between(steps, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
-    axes.plot(steps, mean.value, color=shade, linewidth=2, label=agent.label)
+def _draw(axes: Axes, agent: Agent, x: np.ndarray, values: np.ndarray) -> None:
+    """Draw seeds (S, T) thin, their interquartile mean bold, its interval as a band."""
+    shade, mean = color(agent), bootstrap_interquartile_mean(values)
+    axes.plot(x, values.T, color=shade, linewidth=0.5, alpha=0.35)
+    axes.fill_between(x, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
+    axes.plot(x, mean.value, color=shade, linewidth=2, label=agent.label)
 
 
-def _dress(axes: Axes, metric: str) -> None:
+def _style(axes: Axes) -> None:
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.25, linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _scale(axes: Axes, metric: str) -> None:
     axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x else "0")
     axes.set_xlim(left=0)
     if metric.endswith("success"):
@@ -131,11 +127,7 @@ def _legend(grid: np.ndarray) -> tuple[list, list]:
 
 
 def profile_figure(evidence: Evidence) -> Figure | None:
-    """Draw the entropy along the way to the goal at the end of training (thesis Fig. 3.8).
-
-    Returns:
-        A matplotlib figure, None where it was not measured.
-    """
+    """Draw the entropy along the way to the goal at the end of training (thesis Fig. 3.8)."""
     settings = [
         setting
         for setting in evidence.experiment.settings
@@ -149,17 +141,52 @@ def profile_figure(evidence: Evidence) -> Figure | None:
     ):
         for agent in evidence.experiment.agents:
             profile = evidence.profile(setting.name, agent.name)
-            if profile is None:
-                continue
-            way, values = profile
-            mean, shade = bootstrap_interquartile_mean(values), colour(agent)
-            axes.plot(way, values.T, color=shade, linewidth=0.5, alpha=0.35)
-            axes.fill_between(way, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
-            axes.plot(way, mean.value, color=shade, linewidth=2, label=agent.label)
+            if profile is not None:
+                _draw(axes, agent, *profile)
         axes.set_xlabel("share of the way from start to goal, on the centre line", fontsize=8)
         axes.set_ylabel("entropy (nats)", fontsize=8)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.25, linewidth=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
+        _style(axes)
         axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def outcomes_figure(evidence: Evidence) -> Figure | None:
+    """Draw the share of seeds that solve their task at the end: a row per agent.
+
+    Each field contains the number of such seeds and their steps until then (interquartile mean;
+    seeds that never solve it count with the length of training). None with a single setting, or
+    where success was not measured.
+    """
+    experiment = evidence.experiment
+    fields = {
+        (row, column): (evidence.solved(setting.name, agent.name), setting.name, agent.name)
+        for column, setting in enumerate(experiment.settings)
+        for row, agent in enumerate(experiment.agents)
+        if "test_success" in evidence.columns(setting.name, agent.name)
+    }
+    columns, rows = len(experiment.settings), len(experiment.agents)
+    if columns < 2 or not fields:
+        return None
+    figure = new_figure(1.6 + 1.5 * columns, 0.9 + 0.5 * rows)
+    axes = figure.subplots()
+    for (row, column), (solved, setting, agent) in fields.items():
+        share = solved.mean()
+        axes.fill_between([column, column + 1], row, row + 1, color=1 - share * (1 - _FULL))
+        text = f"{solved.sum()} of {len(solved)}"
+        if evidence.solved_once(setting, agent).any():
+            steps = interquartile_mean(evidence.steps_until_solved(setting, agent))
+            text += f"\n{float(steps.value):,.0f} steps"
+        shade = "white" if share > _DARK else "black"
+        axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=8, color=shade)
+    axes.set(xlim=(0, columns), ylim=(rows, 0))
+    axes.set_xticks([k + 0.5 for k in range(columns)], [one.name for one in experiment.settings])
+    axes.set_yticks([k + 0.5 for k in range(rows)], [agent.label for agent in experiment.agents])
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0, labelsize=8)
+    for k in range(1, columns):
+        axes.axvline(k, color="white", linewidth=3)
+    for k in range(1, rows):
+        axes.axhline(k, color="white", linewidth=3)
+    axes.spines[:].set_visible(False)
+    axes.set_title("seeds that solve it at the end,\nand steps until they first do", fontsize=9)
     return figure

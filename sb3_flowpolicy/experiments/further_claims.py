@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_flowpolicy.experiments.comparisons import about_equal, at_least_times, ordered, reaches
+from sb3_flowpolicy.experiments.checks import about_equal, at_least_times, ordered, reaches
 from sb3_flowpolicy.experiments.experiment import (
     AGENTS,
     FLOW,
@@ -17,7 +17,7 @@ _SQUARE_STEPS = 200_000
 
 
 def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:
-    """Make one of the two validation experiments, which differ in nothing else.
+    """Make one of the two validation experiments.
 
     Args:
         name: Name of the experiment.
@@ -30,14 +30,14 @@ def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:
         claim="E1",
         source="section 3.1, figure 3.1",
         title=f"{env_id}: do all three agents learn a standard task?",
-        thesis="All three agents learn equally well and end near the tuned results of others, "
-        "2053 on Walker2D and 3485 on Ant.",
+        thesis="All three agents learn equally well and end near the tuned results of others, 2053 "
+        "on Walker2D and 3485 on Ant.",
         settings=(Setting(setting, env_id),),
         checks=tuple(reaches(setting, "test_return", agent, published) for agent in AGENTS),
         steps=1_000_000,
         seeds=3,
         eval_every=20_000,
-        notes=f"The bar is the return that SB3 publishes for its SAC, {published}.",
+        notes=f"The threshold is the return that SB3 publishes for its SAC, {published}.",
     )
 
 
@@ -48,7 +48,7 @@ FURTHER_CLAIMS = (
         name="hold-fixed-alpha",
         claim="E7",
         source="section 3.3.2, figure 3.14",
-        title="Hold the square, fixed temperature: whose entropy is higher?",
+        title="Hold the square, fixed entropy coefficient: does NF keep more entropy?",
         thesis="NF holds over a nat more entropy, with a slightly better training return and a "
         "similar test return.",
         settings=(Setting("hold", "SquareHold-v0"),),
@@ -65,7 +65,7 @@ FURTHER_CLAIMS = (
         name="hold-fixed-entropy",
         claim="E8",
         source="section 3.3.2, figure 3.16",
-        title="Hold the square, learned temperature with a high and a low entropy target",
+        title="Hold the square, learned entropy coefficient, high and low entropy target",
         thesis="At a target of -2 NF collects more during training, at -8 both about the same.",
         settings=tuple(
             Setting(
@@ -87,7 +87,7 @@ FURTHER_CLAIMS = (
         name="move",
         claim="E9",
         source="section 3.3.3, figure 3.17",
-        title="Hold the square and move: whose actions are correlated?",
+        title="Hold the square and move: correlation of the actions",
         thesis="NF's actions of the same axis are clearly correlated, LR's less, Gauss's not.",
         settings=(Setting("move", "SquareMove-v0"),),
         checks=(ordered("move", "same_axis_correlation", (FLOW, LOW_RANK, GAUSS)),),
@@ -99,7 +99,7 @@ FURTHER_CLAIMS = (
         name="move-x",
         claim="E10",
         source="section 3.3.3, figures 3.18 and 3.19",
-        title="Hold the square and move along x only: who moves farther?",
+        title="Hold the square and move along x only: how far do the agents move?",
         thesis="NF's standard deviation of x is about three times Gauss's and its greatest "
         "distance about twice, LR lies between.",
         settings=(Setting("move-x", "SquareMoveX-v0"),),
@@ -111,13 +111,13 @@ FURTHER_CLAIMS = (
         steps=1_500_000,
         eval_every=30_000,
         measures=("same_axis_correlation", "x_std", "x_max"),
-        notes="The thesis saw the agents part after about 1.5 million steps.",
+        notes="In the thesis the agents differ after about 1.5 million steps.",
     ),
     Experiment(
         name="find-goal",
         claim="E11",
         source="section 3.4, figure 3.20",
-        title="Find a goal that cannot be seen: who finds it more often while exploring?",
+        title="Find a hidden goal: how often does each agent find it while exploring?",
         thesis="Holding still finds the goal in about a fifth of the episodes. Gauss stays near "
         "that, NF rises above it.",
         settings=(Setting("find-goal", "SquareFindGoal-v0"),),

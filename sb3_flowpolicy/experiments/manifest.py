@@ -32,7 +32,7 @@ def find(name: str) -> Experiment:
     """Return the experiment of that name.
 
     Raises:
-        ValueError: If there is none; the message says what there is.
+        ValueError: If there is none; the message lists the names.
 
     Example:
         >>> find("sparse-fixed-alpha").claim
@@ -46,7 +46,7 @@ def find(name: str) -> Experiment:
 
 
 def what_is_missing(experiment: Experiment) -> str | None:
-    """Say what an experiment needs that is not here; None if it can run."""
+    """Return what an experiment needs that is not installed; None if it can run."""
     for setting in experiment.settings:
         try:
             register_env(setting.env_id)

@@ -1,7 +1,7 @@
-"""What is measured of a policy, besides what training itself reports.
+"""Measurements of a policy, besides those that training itself reports.
 
-All measurements draw from generators of their own: a run that is measured and one that is not are
-the same run, and measuring twice gives the same numbers.
+All of them draw from generators of their own: measuring does not change a run, and measuring twice
+gives the same numbers.
 """
 
 from __future__ import annotations
@@ -33,19 +33,13 @@ def own_random_numbers(*seed: int) -> Iterator[np.random.Generator]:
         yield np.random.default_rng(sequence)
 
 
-def actor_of(model: SACFlow) -> FlowActor:
-    """Return the model's actor."""
-    assert isinstance(model.actor, FlowActor)
-    return model.actor
-
-
 def policy_entropy(model: SACFlow, seed: int) -> float | None:
     """Estimate the policy's mean entropy at states of the replay buffer, nats; None for gSDE."""
     if not isinstance(model.actor, FlowActor):
         return None
     obs = _buffer_states(model, seed)
     with own_random_numbers(seed, model.num_timesteps, 1):
-        return actor_of(model).entropy(obs, N_SAMPLES).mean().item()
+        return model.actor.entropy(obs, N_SAMPLES).mean().item()
 
 
 def same_axis_correlation(model: SACFlow, seed: int) -> float:
@@ -53,9 +47,10 @@ def same_axis_correlation(model: SACFlow, seed: int) -> float:
 
     The actions are x and y of each finger in turn: pairs of even and of odd indices.
     """
+    assert isinstance(model.actor, FlowActor)
     obs = _buffer_states(model, seed)[:64]
     with own_random_numbers(seed, model.num_timesteps, 2):
-        correlation = actor_of(model).action_correlation(obs).abs().mean(0)
+        correlation = model.actor.action_correlation(obs).abs().mean(0)
     index = th.arange(len(correlation))
     same = (index[:, None] % 2 == index % 2) & (index[:, None] != index)
     return correlation[same].mean().item()
@@ -72,8 +67,7 @@ def _buffer_states(model: SACFlow, seed: int) -> th.Tensor:
 MEASURES: dict[str, Callable[[SACFlow, int], float]] = {
     "same_axis_correlation": same_axis_correlation
 }
-"""Further columns of a table; an experiment names those it wants."""
-
+"""Further columns of a table, chosen by an experiment."""
 
 TRAINING_INFOS = ("x_std", "x_max")
 """Further columns: means over the training episodes since the last measurement, from their infos
@@ -99,7 +93,7 @@ class DeterministicEpisodes:
         """Return mean return and success rate of each policy, exploring if not ``deterministic``.
 
         Episodes start from the same seeds at every call, far from those of training. The success
-        rate is None where the environment does not tell.
+        rate is None if the environment does not report success.
         """
         offsets = [10**6 * (seed + 1) + k for seed in seeds for k in range(self.n_episodes)]
         obs, _ = self.venv.reset(seed=offsets)  # type: ignore[arg-type]
@@ -107,30 +101,23 @@ class DeterministicEpisodes:
         returns, running = np.zeros(count), np.ones(count, dtype=bool)
         success: np.ndarray | None = None
         while running.any():
-            obs, rewards, terminated, truncated, infos = self.venv.step(
-                self._act(models, obs, deterministic)
-            )
+            actions = [
+                model.predict(part, deterministic=deterministic)[0]
+                for model, part in zip(models, np.split(obs, self.n_models), strict=True)
+            ]
+            obs, rewards, terminated, truncated, infos = self.venv.step(np.concatenate(actions))
             returns += rewards * running
             ended = (terminated | truncated) & running
-            told = infos.get("final_info", {}).get("is_success")
-            if ended.any() and told is not None:
+            reported = infos.get("final_info", {}).get("is_success")
+            if ended.any() and reported is not None:
                 success = np.zeros(count) if success is None else success
-                success[ended] = np.asarray(told)[ended]
+                success[ended] = np.asarray(reported)[ended]
             running &= ~ended
         shape = (self.n_models, self.n_episodes)
         means = returns.reshape(shape).mean(1).tolist()
         if success is None:
             return [(mean, None) for mean in means]
         return list(zip(means, success.reshape(shape).mean(1).tolist(), strict=True))
-
-    def _act(self, models: list[SACFlow], obs: np.ndarray, deterministic: bool) -> np.ndarray:
-        parts = np.split(obs, self.n_models)
-        return np.concatenate(
-            [
-                model.predict(part, deterministic=deterministic)[0]
-                for model, part in zip(models, parts, strict=True)
-            ]
-        )
 
     def close(self) -> None:
         """Close the environments."""
@@ -141,7 +128,7 @@ def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[fl
     """Estimate the entropy at points of the centre line from start to goal.
 
     Returns:
-        ``way``, shares of the way to the goal in [0, 1), and ``entropy`` in nats; None for
+        ``way``, fractions of the way to the goal in [0, 1), and ``entropy`` in nats; None for
         environments other than the Tunnel.
     """
     env = make_env(env_id).unwrapped
@@ -154,8 +141,9 @@ def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[fl
     if config.path == "circle":
         radius = np.full(len(points), config.radius)
         points = np.column_stack([points, radius, np.linalg.norm(points, axis=1)])
+    assert isinstance(model.actor, FlowActor)
     with own_random_numbers(seed, model.num_timesteps, 3):
-        entropy = actor_of(model).entropy(th.as_tensor(points.astype(np.float32)), PROFILE_SAMPLES)
+        entropy = model.actor.entropy(th.as_tensor(points.astype(np.float32)), PROFILE_SAMPLES)
     return {"way": _rounded(way), "entropy": _rounded(entropy.numpy())}
 
 
@@ -180,7 +168,7 @@ def policy_picture(model: SACFlow, env_id: str, seed: int) -> dict[str, Any] | N
         done = terminated or truncated
     trail = np.stack(states)
     chosen = np.unique(np.linspace(0, len(states) - 2, PICTURE_STATES).round().astype(int))
-    actor = actor_of(model)
+    actor = model.actor
     with own_random_numbers(seed, model.num_timesteps, 4):
         batch = th.as_tensor(np.repeat(trail[chosen], PICTURE_SAMPLES, axis=0))
         samples = model.policy.unscale_action(actor(batch).numpy())

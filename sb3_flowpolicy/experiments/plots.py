@@ -1,4 +1,4 @@
-"""Interactive curves for the page: the same lines as ``figures.py`` draws."""
+"""Interactive curves for the page: the same lines as in ``figures.py``."""
 
 from __future__ import annotations
 
@@ -10,22 +10,12 @@ import plotly.graph_objects as go
 from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
-from sb3_flowpolicy.experiments.figures import colour, smoothed
+from sb3_flowpolicy.experiments.figures import color, smoothed
 from sb3_flowpolicy.experiments.tables import WORDS
 
 
 def curves_plot(evidence: Evidence, setting: str, metric: str) -> go.Figure:
-    """Draw one metric of all agents on one setting.
-
-    Args:
-        evidence: Results, complete or not.
-        setting: Name of the setting.
-        metric: Name of the metric.
-
-    Returns:
-        A plotly figure: each agent's seeds thin, their interquartile mean bold, its 95 %
-        interval a band; a click on the legend hides an agent.
-    """
+    """Draw one metric of all agents on one setting; a click on the legend hides an agent."""
     figure = go.Figure()
     for agent in evidence.experiment.agents:
         if metric in evidence.columns(setting, agent.name):
@@ -53,7 +43,7 @@ def profile_plot(evidence: Evidence, setting: str) -> go.Figure | None:
 
 
 def _add(figure: go.Figure, agent: Agent, x: np.ndarray, values: np.ndarray) -> None:
-    shade, mean = colour(agent), bootstrap_interquartile_mean(values)
+    shade, mean = color(agent), bootstrap_interquartile_mean(values)
     group: dict[str, Any] = {"legendgroup": agent.name, "mode": "lines"}
     # One trace for all seeds, with gaps in between: a phone draws few traces quickly.
     figure.add_scatter(

@@ -25,12 +25,6 @@ def policies_figure(evidence: Evidence) -> Figure | None:
 
     A row per setting, agent and moment of training; first the whole episode, then views of the
     agent at several of its states.
-
-    Args:
-        evidence: Results, complete or not.
-
-    Returns:
-        A matplotlib figure, None where no policies were recorded.
     """
     rows = [
         (setting, agent, picture)

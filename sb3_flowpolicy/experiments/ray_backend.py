@@ -1,8 +1,8 @@
-"""Doing work items on a Ray cluster: the same items, on as many machines as there are.
+"""Do work items on a Ray cluster.
 
 Each item is a task with one core. It works in a temporary folder of its machine and returns its
-files, which are written into the results here. A task whose machine is lost starts anew on
-another; nothing of an item arrives here before all of it has.
+files, which are written into the results here once the item is complete. A task whose machine is
+lost starts again on another one.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.runner import ONE_THREAD
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import WorkItem
 
 MOST_RETRIES = 10
-"""Losing a machine is nobody's fault, but an item that brings every machine down must end."""
+"""Lost machines are expected; an item that crashes every machine is not."""
 _POLL_SECONDS = 0.5
 
 
@@ -28,9 +29,9 @@ def run_on_ray(
     """Do items as Ray tasks.
 
     Args:
-        folder: Folder of the experiment, claimed; only this machine needs to see it.
-        items: What to do.
-        progress: Shows how far they are.
+        folder: Folder of the experiment, claimed; only this machine needs access to it.
+        items: The items to do.
+        progress: Bar to update.
         address: Cluster to join. Default: the one that this process is connected to, that of the
             variable ``RAY_ADDRESS``, or a new one on this machine alone.
 
@@ -38,7 +39,7 @@ def run_on_ray(
         ModuleNotFoundError: If Ray is missing.
         ValueError: If an item's files are damaged.
         RuntimeError: If an item could not be done.
-        OSError: If a file cannot be written here.
+        OSError: If a file cannot be written here, or no cluster answers.
     """
     try:
         import ray
@@ -50,12 +51,9 @@ def run_on_ray(
         ) from error
 
     if not ray.is_initialized():
-        try:
-            ray.init(address=address, log_to_driver=False, logging_level="warning")
-        except ConnectionError as error:
-            raise RuntimeError(f"no Ray cluster answers at {address!r}: {error}") from error
+        ray.init(address=address, log_to_driver=False, logging_level="warning")
     environment = {"env_vars": dict.fromkeys(ONE_THREAD, "1")}
-    # Beside the runner: on another machine it would be lost with it.
+    # On the runner's machine, which is the only one that must not be lost.
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
     task = ray.remote(_run_away).options(
@@ -69,7 +67,9 @@ def run_on_ray(
                 progress.update(key, steps)
             for reference in done:
                 item = waiting.pop(reference)
-                _collect(ItemFiles(folder, item.key), ray.get(reference))
+                for name, data in ray.get(reference).items():
+                    with replacing(folder / name) as draft:
+                        draft.write_bytes(data)
                 progress.update(item.key, item.steps)
     except RayTaskError as error:
         for kind in (OSError, ValueError):
@@ -88,7 +88,7 @@ def run_on_ray(
 
 
 class _Board:
-    """Where tasks post how far they are; lives beside the runner."""
+    """Collects the progress of all tasks on the runner's machine."""
 
     def __init__(self) -> None:
         self.steps: dict[str, int] = {}
@@ -102,24 +102,15 @@ class _Board:
 
 
 def _run_away(item: WorkItem, board: object) -> dict[str, bytes]:
-    """Do an item on whatever machine this is, and return its files."""
+    """Do an item on another machine, and return its files."""
     from sb3_flowpolicy.experiments.training import run_item
 
     folder = Path(tempfile.mkdtemp(prefix="sb3_flowpolicy_"))
     try:
         run_item(item, folder, lambda key, steps: board.post.remote(key, steps))  # type: ignore[attr-defined]
-        return {path.name: path.read_bytes() for path in _paths(ItemFiles(folder, item.key))}
+        files = ItemFiles(folder, item.key)
+        # The file that declares the item finished comes last.
+        paths = (files.table, files.details, files.done)
+        return {path.name: path.read_bytes() for path in paths if path.exists()}
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _paths(files: ItemFiles) -> list[Path]:
-    """Return the files of a finished item; what declares it finished comes last."""
-    return [path for path in (files.table, files.details, files.done) if path.exists()]
-
-
-def _collect(files: ItemFiles, content: dict[str, bytes]) -> None:
-    for name, data in content.items():
-        partial = files.folder / f".{name}.partial"
-        partial.write_bytes(data)
-        partial.replace(files.folder / name)

@@ -1,10 +1,12 @@
-"""Doing all work items of a plan on this machine, one process per core."""
+"""Run a plan: claim its folder, take over what was done before, and train the rest in processes."""
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import queue
+import shutil
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -15,14 +17,13 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from sb3_flowpolicy.experiments.costs import item_seconds
-from sb3_flowpolicy.experiments.integrity import rows_of_seeds
+from sb3_flowpolicy.common.machine import machine
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.settings_file import claim_folder
-from sb3_flowpolicy.experiments.store import ItemFiles
-from sb3_flowpolicy.experiments.work import Plan, WorkItem, describe
+from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder, commits_of, read_settings
+from sb3_flowpolicy.experiments.work import Plan, WorkItem, describe, item_seconds
 
-# Read by OpenMP and numba when a process starts: one thread each, as many processes as cores.
+# OpenMP and numba read these when a process starts: one thread each, one process per core.
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _reports: Any = None
 
@@ -33,7 +34,7 @@ def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
 
     Args:
         out: Folder of all experiments.
-        plan: What is going to be run.
+        plan: The plan to run.
 
     Yields:
         The experiment's own folder.
@@ -53,11 +54,7 @@ def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
 
 
 def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
-    """Return the items that are still to be done.
-
-    Raises:
-        ValueError: If files of an item that is finished are damaged or missing.
-    """
+    """Return the items to do; raise ``ValueError`` if files of a finished one are damaged."""
     found = []
     for item in plan.items:
         files = ItemFiles(folder, item.key)
@@ -65,8 +62,63 @@ def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
         if done is None:
             found.append(item)
         else:
-            rows_of_seeds(files, describe(item), done)
+            files.rows_of_seeds(describe(item), done)
     return found
+
+
+def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
+    """Copy finished items of other experiments that did exactly the same work.
+
+    Items are the same if everything that results depend on is equal, including the commit and the
+    versions. Nothing is copied if the commit is unknown or source files differ from it, if an item
+    was begun or continued at another commit, or if its files have changed since it was finished.
+
+    Args:
+        folder: Folder of the experiment, claimed; others lie beside it.
+        items: The items still to be done.
+
+    Returns:
+        Key of each copied item to the experiment that it came from.
+
+    Raises:
+        ValueError: If a file of another experiment is corrupt; the message names it.
+    """
+    here = machine()
+    adopted: dict[str, str] = {}
+    if here["commit"] is None or here["commit"].endswith("-dirty"):
+        return adopted
+    wanted = {_work_of(describe(item)): item.key for item in items}
+    for other in EXPERIMENTS:  # ignore unrelated folders
+        settings = None if other == folder.name else read_settings(folder.parent / other)
+        for key, described in (settings or {"items": {}})["items"].items():
+            mine = wanted.get(_work_of(described))
+            if mine is None or mine in adopted:
+                continue
+            there = ItemFiles(folder.parent / other, key)
+            done = there.read_done()
+            if done is not None and _same_code(done, here) and there.damage(done) is None:
+                _copy(there, ItemFiles(folder, mine), done)
+                adopted[mine] = other
+    return adopted
+
+
+def _same_code(done: dict[str, Any], here: dict[str, Any]) -> bool:
+    return commits_of(done) == [here["commit"]] and done["machine"]["versions"] == here["versions"]
+
+
+def _work_of(described: dict[str, Any]) -> str:
+    """Return everything but the experiment's own names, as text: in files tuples are lists."""
+    work = {k: v for k, v in described.items() if k not in ("setting", "agent")}
+    return json.dumps(work, sort_keys=True)
+
+
+def _copy(there: ItemFiles, here: ItemFiles, done: dict[str, Any]) -> None:
+    shutil.rmtree(here.checkpoints, ignore_errors=True)
+    for source, target in ((there.table, here.table), (there.details, here.details)):
+        target.unlink(missing_ok=True)
+        if source.exists():
+            shutil.copyfile(source, target)
+    here.finish({**done, "adopted_from": f"{there.folder.name}/{there.key}"})
 
 
 def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
@@ -74,8 +126,8 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
 
     Args:
         folder: Folder of the experiment, claimed.
-        items: What to do.
-        progress: Shows how far they are.
+        items: The items to do.
+        progress: Bar to update.
         workers: Number of processes, at least 1.
 
     Raises:
@@ -102,11 +154,11 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
             _pass_on(reports, progress)
         except BrokenProcessPool as error:
             raise RuntimeError(
-                "a process was killed, for want of memory perhaps; the same command goes on from "
-                "the last checkpoint, --workers 1 needs the least memory"
+                "a process was killed, perhaps because memory ran out; the same command goes on "
+                "from the last checkpoint, and --workers 1 needs the least memory"
             ) from error
         except BaseException:
-            # Others would run to their end, which may be hours away.
+            # Otherwise the other items would run to their end, which may be hours away.
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 process.terminate()
@@ -143,7 +195,7 @@ def _start_worker(reports: Any) -> None:
 
     def end_with_parent() -> None:
         parent.join()
-        os._exit(1)  # a runner that was killed must not leave processes that go on writing
+        os._exit(1)  # after the runner was killed, its processes must not go on writing
 
     threading.Thread(target=end_with_parent, daemon=True).start()
 

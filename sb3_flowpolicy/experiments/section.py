@@ -1,24 +1,36 @@
-"""What there is to say about one experiment, for the page and for the docs."""
+"""The content of one experiment's section, for the page and for the docs."""
 
 from __future__ import annotations
 
 import functools
 import io
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_flowpolicy.common.statistics import RESAMPLES, RESAMPLES_OF_PAIRS
 from sb3_flowpolicy.experiments import evidence as definitions
-from sb3_flowpolicy.experiments.costs import in_words, plan_seconds
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.experiment import NOT_REPRODUCED, PARTLY, REPRODUCED, Finding
-from sb3_flowpolicy.experiments.figures import SMOOTHED_OVER, curves_figure, panels, profile_figure
-from sb3_flowpolicy.experiments.integrity import reservation
+from sb3_flowpolicy.experiments.experiment import (
+    NOT_REPRODUCED,
+    PARTLY,
+    REPRODUCED,
+    Experiment,
+    Finding,
+)
+from sb3_flowpolicy.experiments.figures import (
+    SMOOTHED_OVER,
+    curves_figure,
+    outcomes_figure,
+    panels,
+    profile_figure,
+)
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
-from sb3_flowpolicy.experiments.outcomes import outcomes_figure
 from sb3_flowpolicy.experiments.policy_pictures import policies_figure
+from sb3_flowpolicy.experiments.store import differences
 from sb3_flowpolicy.experiments.tables import Table, facts, results_table
-from sb3_flowpolicy.experiments.work import make_plan
+from sb3_flowpolicy.experiments.work import FIRST_SEED, in_words, make_plan, plan_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,12 +49,12 @@ METHOD = (
     f"solved'. Oscillations are counted as swings of at least "
     f"{definitions.OSCILLATIONS['train_return']:.0%} of the highest test return in training "
     f"return, {definitions.OSCILLATIONS['entropy']:g} nats in entropy and "
-    f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the temperature, from the "
-    "first training success on; the curve with the fewest decides. Logs of unequal length are "
-    "interpolated to a common grid that ends with the shortest. "
+    f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the entropy coefficient, "
+    "from the first training success on; the curve with the fewest decides. Logs of unequal "
+    "length are interpolated to a common grid that ends with the shortest. "
     f"Curves are drawn as means over {SMOOTHED_OVER} measurements. A claim is reproduced if all "
     "lines of its rule hold, not reproduced if none does, partly reproduced otherwise. Our own "
-    "experiments have no claim to reproduce; their rules say who gets how far."
+    "experiments have no claim to reproduce; each line of their rules describes one agent."
 )
 
 _OURS_IN_WORDS = {
@@ -53,15 +65,11 @@ _OURS_IN_WORDS = {
 
 
 class Section:
-    """What the page says about one experiment.
-
-    Args:
-        evidence: Its results.
-    """
+    """Verdict, tables and figures of one experiment."""
 
     def __init__(self, evidence: Evidence) -> None:
         self.evidence, self.experiment = evidence, evidence.experiment
-        self.verdict, self.findings = self.experiment.judge(evidence)
+        self.verdict, self.findings = evidence.judge()
         self.measured = any(
             evidence.has(setting.name, agent.name)
             for setting in self.experiment.settings
@@ -71,20 +79,20 @@ class Section:
         self.facts = facts(evidence)
         self.missing = what_is_missing(self.experiment)
         self.estimate = in_words(plan_seconds(make_plan(self.experiment), 2))
-        # A try-out must not pass for a result.
+        # Trials must not be taken for results.
         self.reservation = (
             reservation(self.experiment, evidence.settings) if evidence.items else None
         )
 
     @property
     def verdict_in_words(self) -> str:
-        """The verdict as it is told: experiments of ours have no claim to reproduce."""
+        """The verdict in words; our own experiments have no claim to reproduce."""
         ours = self.experiment.source == "ours"
         return _OURS_IN_WORDS.get(self.verdict, self.verdict) if ours else self.verdict
 
     @property
     def rule(self) -> list[tuple[str, str, Finding]]:
-        """Statements of the rule, each with a mark and what was found."""
+        """Statements of the rule, each with a mark and the result."""
         marks = {True: "holds", False: "fails", None: "open"}
         return [
             (check.statement, marks[finding.holds], finding)
@@ -116,6 +124,22 @@ class Section:
             "policies": policies_figure(self.evidence),
         }
         return {name: figure for name, figure in found.items() if figure is not None}
+
+
+def reservation(experiment: Experiment, settings: Mapping[str, Any]) -> str | None:
+    """Explain why results with these settings are not the experiment's own, None if they are."""
+    planned = make_plan(experiment)
+    seeds = settings["seeds"]
+    if settings["steps"] < planned.steps or len(seeds) < len(planned.seeds):
+        return "trial, not a result"
+    if seeds[0] != FIRST_SEED:
+        return f"seeds from {seeds[0]} on, which are for tuning: not a result"
+    together = max(len(item["seeds"]) for item in settings["items"].values())
+    same = make_plan(experiment, steps=settings["steps"], seeds=len(seeds), seeds_per_item=together)
+    wanted = json.loads(json.dumps(same.settings()))
+    if settings != wanted:
+        return f"made with other settings ({differences(dict(settings), wanted)[0]})"
+    return None
 
 
 def read_results(results: Path) -> list[Evidence]:

@@ -1,10 +1,10 @@
-"""Results on disk: append-only files per work item.
+"""Results on disk: the settings of an experiment, and append-only files per work item.
 
 A folder holds, per experiment, ``settings.json`` and three files per item:
 
 =======================  ======================================================================
-``KEY.csv``              one line per measurement and seed, appended as the run goes
-``KEY.details.jsonl``    what does not fit a table: the policy's entropy along the path, samples
+``KEY.csv``              one line per measurement and seed, appended during the run
+``KEY.details.jsonl``    what does not fit a table: entropy profiles, recorded policies
 ``KEY.done.json``        written last; commit, versions, machine and time
 =======================  ======================================================================
 
@@ -24,20 +24,19 @@ from typing import Any
 
 from sb3_flowpolicy.common.files import read_json, require, write_json
 
+SCHEMA = 1
+"""Version of the files; raised when they change their meaning."""
+
 BASIC_COLUMNS = (
-    "seed",
-    "step",
-    "episodes",
-    "train_return",
-    "train_success",
-    "test_return",
-    "test_success",
-    "entropy",
-    "ent_coef",
+    *("seed", "step", "episodes", "train_return", "train_success", "test_return"),
+    *("test_success", "entropy", "ent_coef"),
 )
 Row = dict[str, float | None]
 
-DONE_FIELDS = {
+# What the files hold, see common.files.require.
+_SETTINGS_FIELDS = {"schema": int, "experiment": str, "steps": int, "seeds": list, "items": dict}
+_ITEM_FIELDS = {"setting": str, "agent": str, "seeds": list, "steps": int}
+_DONE_FIELDS = {
     **{"key": str, "steps": int, "seeds": list, "table": int, "details": int, "sha256": str},
     **{"cpu_seconds": (int, float), "steps_per_second": (int, float)},
     "machine": {
@@ -45,16 +44,79 @@ DONE_FIELDS = {
         **{"processor": str, "python": str, "versions": dict},
     },
 }
-"""What ``KEY.done.json`` holds, see :func:`~sb3_flowpolicy.common.files.require`."""
-
-DETAIL_FIELDS = {
+_DETAIL_FIELDS = {
     "profile": {"seed": int, "way": list, "entropy": list},
     "picture": {
         **{"seed": int, "step": int, "steps": list},
         **{"positions": list, "samples": list, "trail": list},
     },
 }
-"""Kinds of lines in ``KEY.details.jsonl``, and what each holds."""
+_ADVICE = "restore the file, or delete all files of this item and run it again"
+
+
+def read_settings(folder: Path) -> dict[str, Any] | None:
+    """Return the settings of a folder's results, None if it holds none.
+
+    Args:
+        folder: Folder of one experiment, named after it.
+
+    Raises:
+        ValueError: If the file is corrupt, of another version, or of another experiment.
+    """
+    path = folder / "settings.json"
+    if not path.is_file():
+        return None
+    settings = read_json(path, _SETTINGS_FIELDS)
+    if settings["schema"] != SCHEMA:
+        raise ValueError(f"{path} must be of schema {SCHEMA}, got {settings['schema']}")
+    if settings["experiment"] != folder.name:
+        raise ValueError(
+            f"{path} must be in a folder named after its experiment, "
+            f"{settings['experiment']!r}, got {folder.name!r}"
+        )
+    for key, item in settings["items"].items():
+        require(f"{path}: {key}", item, _ITEM_FIELDS)
+    return settings
+
+
+def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Make a folder belong to these settings, or check that it does.
+
+    Raises:
+        ValueError: If it holds results of other settings; the message names the differences.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "settings.json"
+    if not path.exists():
+        strays = [one.name for one in folder.glob("*.csv")]
+        if strays:
+            raise ValueError(f"{folder} must be new or have its settings.json, got only {strays}")
+        return write_json(path, settings)
+    found, wanted = read_json(path), json.loads(json.dumps(settings))
+    if found != wanted:
+        named = "; ".join(differences(found, wanted)[:5])
+        raise ValueError(
+            f"{folder} must hold results of the same settings, got others ({named}). "
+            "Choose another folder with --out, or use the settings of the first run"
+        )
+
+
+def differences(found: Any, wanted: Any, where: str = "") -> list[str]:
+    """Describe the leaves in which two nested objects differ."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return [
+            difference
+            for key in sorted(found.keys() | wanted.keys())
+            for difference in differences(
+                found.get(key), wanted.get(key), f"{where}.{key}" if where else key
+            )
+        ]
+    return [] if found == wanted else [f"{where}: there {_short(found)}, now {_short(wanted)}"]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 class ItemFiles:
@@ -71,6 +133,7 @@ class ItemFiles:
         self.details = folder / f"{key}.details.jsonl"
         self.done = folder / f"{key}.done.json"
         self.checkpoints = folder / "checkpoints" / key
+        self.advice = f"delete {self.checkpoints} and {self.table} to repeat this item"
 
     @property
     def finished(self) -> bool:
@@ -78,9 +141,9 @@ class ItemFiles:
         return self.done.is_file()
 
     def append_rows(self, rows: Sequence[Mapping[str, float | None]]) -> None:
-        """Append one line per row; the first one brings the head."""
+        """Append one line per row, after the header in a new file."""
         columns = list(rows[0])
-        lines = [",".join(_number(row[name]) for name in columns) for row in rows]
+        lines = [",".join(_format(row[name]) for name in columns) for row in rows]
         if not self.table.exists() or self.table.stat().st_size == 0:
             lines.insert(0, ",".join(columns))
         _append(self.table, "\n".join(lines) + "\n")
@@ -90,7 +153,7 @@ class ItemFiles:
         _append(self.details, json.dumps(detail, separators=(",", ":")) + "\n")
 
     def fingerprint(self) -> dict[str, Any]:
-        """Return length and contents, in short: what a checkpoint has to remember."""
+        """Return the lengths of both files and a digest of their contents."""
         digest = hashlib.sha256()
         lengths = {}
         for name, path in self._paths().items():
@@ -100,13 +163,10 @@ class ItemFiles:
         return {**lengths, "sha256": digest.hexdigest()}
 
     def damage(self, noted: Mapping[str, Any]) -> str | None:
-        """Say how the files differ from what they were.
+        """Describe how the files differ from an earlier :meth:`fingerprint`, None if not at all.
 
         Args:
-            noted: What :meth:`fingerprint` returned; the ``sha256`` may be missing.
-
-        Returns:
-            A sentence; None if they are the same.
+            noted: The fingerprint; the ``sha256`` may be missing.
         """
         found = self.fingerprint()
         for name, path in self._paths().items():
@@ -117,10 +177,7 @@ class ItemFiles:
         return None
 
     def cut_to(self, noted: Mapping[str, Any]) -> None:
-        """Drop what was written after a checkpoint, half a line perhaps.
-
-        Args:
-            noted: What :meth:`fingerprint` returned then.
+        """Drop everything that was written after a :meth:`fingerprint`, even half a line.
 
         Raises:
             ValueError: If the files hold less than they did, or something else.
@@ -130,10 +187,7 @@ class ItemFiles:
                 os.truncate(path, noted[name])
         damage = self.damage(noted)
         if damage:
-            raise ValueError(
-                f"{damage}: restore it, or delete {self.checkpoints} and {self.table} to repeat "
-                "this item"
-            )
+            raise ValueError(f"{damage}: restore it, or {self.advice}")
 
     def _paths(self) -> dict[str, Path]:
         return {"table": self.table, "details": self.details}
@@ -149,11 +203,7 @@ class ItemFiles:
         Raises:
             ValueError: If a line is corrupt; the message names file and line.
         """
-        if not self.table.exists():
-            return []
-        lines = self.table.read_text(errors="replace").splitlines(keepends=True)
-        if lines and not lines[-1].endswith("\n") and not self.finished:
-            lines.pop()  # it is being written, or the run was interrupted here
+        lines = self._lines(self.table)
         if not lines:
             return []
         columns = lines[0].rstrip("\n").split(",")  # as append_rows writes it, without quotes
@@ -171,28 +221,30 @@ class ItemFiles:
         Raises:
             ValueError: If a line is corrupt; the message names file and line.
         """
-        if not self.details.exists():
-            return []
         found = []
-        lines = self.details.read_text(errors="replace").splitlines(keepends=True)
-        if lines and not lines[-1].endswith("\n") and not self.finished:
-            lines.pop()
-        for number, line in enumerate(lines, start=1):
+        for number, line in enumerate(self._lines(self.details), start=1):
+            where = f"{self.details}, line {number}"
             try:
                 detail = json.loads(line)
             except (ValueError, RecursionError) as error:
-                raise ValueError(
-                    f"{self.details}, line {number} must be JSON, got {line[:60]!r}: {_ADVICE}"
-                ) from error
-            where = f"{self.details}, line {number}"
+                raise ValueError(f"{where} must be JSON, got {line[:60]!r}: {_ADVICE}") from error
             require(where, detail, {"kind": str})
-            if detail["kind"] not in DETAIL_FIELDS:
+            if detail["kind"] not in _DETAIL_FIELDS:
                 raise ValueError(
-                    f"{where} must be of a kind among {[*DETAIL_FIELDS]}, got {detail['kind']!r}"
+                    f"{where} must be of a kind among {[*_DETAIL_FIELDS]}, got {detail['kind']!r}"
                 )
-            require(where, detail, DETAIL_FIELDS[detail["kind"]])
+            require(where, detail, _DETAIL_FIELDS[detail["kind"]])
             found.append(detail)
         return found
+
+    def _lines(self, path: Path) -> list[str]:
+        """Return the lines of a file; the last may be incomplete only if the item is finished."""
+        if not path.exists():
+            return []
+        lines = path.read_text(errors="replace").splitlines(keepends=True)
+        if lines and not lines[-1].endswith("\n") and not self.finished:
+            lines.pop()  # it is being written, or the run was interrupted here
+        return lines
 
     def read_done(self) -> dict[str, Any] | None:
         """Return the facts of a finished item, None of an unfinished one.
@@ -202,17 +254,45 @@ class ItemFiles:
         """
         if not self.finished:
             return None
-        done = read_json(self.done, DONE_FIELDS)
+        done = read_json(self.done, _DONE_FIELDS)
         if done["key"] != self.key:
             raise ValueError(f"{self.done} must be of {self.key}, got {done['key']!r}: {_ADVICE}")
         return done
 
+    def rows_of_seeds(
+        self, item: Mapping[str, Any], done: Mapping[str, Any] | None
+    ) -> dict[int, list[Row]]:
+        """Return the rows by seed, in order of steps; seeds without rows are left out.
 
-_ADVICE = "restore the file, or delete all files of this item and run it again"
+        Args:
+            item: The item's description in the folder's settings.
+            done: Facts from when it was finished; None if it is not.
+
+        Raises:
+            ValueError: If a line is corrupt or, once the item is finished, if a file was changed.
+        """
+        if done is not None:
+            if done["seeds"] != list(item["seeds"]) or done["steps"] < item["steps"]:
+                raise ValueError(
+                    f"{self.done} must be of {item['steps']} steps of seeds {list(item['seeds'])}, "
+                    f"got {done['steps']} of {done['seeds']}"
+                )
+            damage = self.damage(done)
+            if damage:
+                raise ValueError(f"{damage}: {_ADVICE}")
+        logs: dict[int, list[Row]] = {}
+        for row in self.read_rows():
+            logs.setdefault(int(row["seed"] or 0), []).append(row)
+        return logs
 
 
-def _number(value: float | None) -> str:
-    """Five digits are more than a curve shows; whole numbers stay whole."""
+def commits_of(done: Mapping[str, Any]) -> list[str | None]:
+    """Return the commits of all sessions; old results contain only that of the last."""
+    return done.get("commits", [done["machine"]["commit"]])
+
+
+def _format(value: float | None) -> str:
+    """Write five digits, more than a curve shows; whole numbers stay whole."""
     if value is None:
         return ""
     if not math.isfinite(value):
@@ -221,22 +301,22 @@ def _number(value: float | None) -> str:
 
 
 def _parse(path: Path, number: int, line: str, columns: list[str]) -> Row:
-    cells = line.rstrip("\n").split(",")
     try:
-        if not line.endswith("\n") or len(cells) != len(columns):
-            raise ValueError
-        row: Row = {
-            name: float(cell) if cell else None for name, cell in zip(columns, cells, strict=True)
-        }
-        if row["seed"] is None or row["step"] is None:
-            raise ValueError
-        if not all(value is None or math.isfinite(value) for value in row.values()):
-            raise ValueError
+        cells = [float(cell) if cell else None for cell in line.rstrip("\n").split(",")]
     except ValueError:
+        cells = []
+    row = dict(zip(columns, cells, strict=False))
+    sound = (
+        line.endswith("\n")
+        and len(cells) == len(columns)
+        and None not in (row["seed"], row["step"])
+        and all(value is None or math.isfinite(value) for value in cells)
+    )
+    if not sound:
         raise ValueError(
             f"{path}, line {number} must hold {len(columns)} finite numbers "
             f"({','.join(columns)}), got {line[:80]!r}: {_ADVICE}"
-        ) from None
+        )
     return row
 
 

@@ -1,12 +1,12 @@
-"""Numbers of an experiment as rows of text, for the page and for Markdown."""
+"""Results of an experiment as rows of text, for the page and for Markdown."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from sb3_flowpolicy.common.statistics import Estimate, interquartile_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.store import commits_of
 from sb3_flowpolicy.experiments.work import FIRST_SEED
 
 WORDS = {
@@ -15,12 +15,12 @@ WORDS = {
     "test_return": "test return",
     "test_success": "test success",
     "entropy": "entropy",
-    "ent_coef": "temperature",
+    "ent_coef": "entropy coefficient",
     "same_axis_correlation": "correlation of same-axis actions",
     "x_std": "standard deviation of x",
     "x_max": "greatest distance along x",
 }
-"""How metrics are called in sentences."""
+"""Names of metrics in sentences."""
 
 _DECIMALS = {"ent_coef": 4, "x_std": 3, "x_max": 3}
 
@@ -39,7 +39,7 @@ class Table:
 
 
 def in_digits(metric: str, estimate: Estimate) -> str:
-    """Return an estimate with as many digits as its metric is worth."""
+    """Format an estimate with the digits that suit its metric."""
     return f"{estimate:.{_DECIMALS.get(metric, 2)}f}"
 
 
@@ -91,7 +91,7 @@ def _counts(evidence: Evidence, setting: str, agent: str) -> list[str]:
 
 
 def facts(evidence: Evidence) -> dict[str, str]:
-    """Return how the results came about: command, seeds, cost, commit, machine."""
+    """Return the origin of the results: command, seeds, cost, commit, machine."""
     done = [one for one in evidence.done.values() if one]
     seeds, steps = evidence.seeds, evidence.settings.get("steps", evidence.experiment.steps)
     command = f"python -m sb3_flowpolicy.experiments run {evidence.experiment.name}"
@@ -119,7 +119,7 @@ def facts(evidence: Evidence) -> dict[str, str]:
             "and process, seeds summed"
         )
         found["commit"] = ", ".join(
-            sorted({str(commit) for one in done for commit in _commits(one)})
+            sorted({str(commit) for one in done for commit in commits_of(one)})
         )
         versions = machine["versions"]
         found["machine"] = (
@@ -127,8 +127,3 @@ def facts(evidence: Evidence) -> dict[str, str]:
             + ", ".join(f"{k} {versions[k]}" for k in ("torch", "stable_baselines3", "gymnasium"))
         )
     return found
-
-
-def _commits(done: dict[str, Any]) -> list[str | None]:
-    """Return the commits of all sessions; results of old name that of the last."""
-    return done.get("commits", [done["machine"]["commit"]])

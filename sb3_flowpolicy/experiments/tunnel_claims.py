@@ -1,20 +1,18 @@
-"""Claims E2 to E6 (thesis 3.2, the Tunnel), and one of our own."""
+"""Claims E2 to E6 (thesis 3.2, the Tunnel), and an experiment of ours."""
 
 from __future__ import annotations
 
-from sb3_flowpolicy.experiments.comparisons import (
+from sb3_flowpolicy.experiments.checks import (
     about_equal,
     at_least_times,
     front_loads,
-    no_better_than,
-    ordered,
-    slower,
-)
-from sb3_flowpolicy.experiments.counts import (
     is_steady,
     mostly_fails,
+    no_better_than,
     none_fails,
+    ordered,
     oscillates,
+    slower,
     solved,
 )
 from sb3_flowpolicy.experiments.experiment import (
@@ -41,7 +39,7 @@ TUNNEL_CLAIMS = (
         name="circle-fixed-alpha",
         claim="E2",
         source="section 3.2.2, figures 3.4 to 3.6",
-        title="Circle with dense reward, fixed temperature: whose entropy collapses?",
+        title="Circle with dense reward, fixed entropy coefficient: does the entropy collapse?",
         thesis="All agents end with about the same return. Gauss takes longer and gives up much "
         "more entropy; NF keeps more than LR. One of five NF seeds learned nothing.",
         settings=(Setting("circle", "TunnelCircle-v0"),),
@@ -55,15 +53,15 @@ TUNNEL_CLAIMS = (
         measures=("profile",),
         pictures_at=(0.1, 0.25, 1.0),
         notes="The thesis's flow started from torch's default weights; ours starts as a standard "
-        "normal. The fourth agent starts as the thesis's did, to count the seeds that fail. Seen "
-        "afterwards: Gauss's mean number of steps is the highest, but not by more than chance may "
-        "make of ten seeds, so that line was sharpened and does not hold any more.",
+        "normal. The fourth agent starts as the thesis's did, to count the seeds that fail. "
+        "Observed afterwards: Gauss's mean number of steps is the highest, but the difference is "
+        "within chance for ten seeds, so that line was sharpened and no longer holds.",
     ),
     Experiment(
         name="circle-fixed-entropy",
         claim="E3",
         source="section 3.2.3, figures 3.7 and 3.8",
-        title="Circle with dense reward, learned temperature: where does the entropy go?",
+        title="Circle with dense reward, learned entropy coefficient: entropy along the way",
         thesis="With exploration NF collects about twice Gauss's return, without it they are "
         "equal. Gauss meets the entropy target on the first steps, where it costs least.",
         settings=(Setting("circle", "TunnelCircle-v0", overrides=LEARNED),),
@@ -75,21 +73,21 @@ TUNNEL_CLAIMS = (
         ),
         measures=("profile",),
         pictures_at=(1.0,),
-        notes="The target is minus the dimension of the action space. 'About twice' is taken to "
-        "be at least 1.5 times. Seen afterwards: how far the returns part depends on how progress "
-        "is paid next to the goal, which the thesis does not tell; with ours the way alone earns "
-        "1.36, so a Gauss that fails three episodes in four still earns most of it. In training "
-        "success the two are three times apart. All agents hold most entropy just before the goal, "
-        "where any step will do; that hides Gauss's early entropy from a rule that compares the "
-        "first third of the way with the last. The rule was not changed.",
+        notes="The target is minus the dimension of the action space. 'About twice' is taken to be "
+        "at least 1.5 times. Observed afterwards: the ratio of the returns depends on the reward "
+        "for progress relative to that for the goal, which the thesis does not give; with ours the "
+        "way alone earns 1.36, so a Gauss that fails three episodes in four still earns most of "
+        "the return. Training success differs by a factor of three. All agents have most entropy "
+        "just before the goal, where any step succeeds; that hides Gauss's early entropy from a "
+        "rule that compares the first third of the way with the last. The rule was not changed.",
     ),
     Experiment(
         name="circle-narrow",
         claim="E4",
         source="section 3.2.3, figure 3.9",
-        title="Narrower circle, larger final reward, learned temperature: who oscillates?",
-        thesis="Once Gauss has found the goal, its return, entropy and temperature swing up and "
-        "down together, in every seed; those of NF and LR do not.",
+        title="Narrower circle, larger final reward, learned entropy coefficient: oscillations",
+        thesis="Once Gauss has found the goal, its return, entropy and entropy coefficient swing "
+        "up and down together, in every seed; those of NF and LR do not.",
         settings=(Setting("narrow", "TunnelCircleNarrow-v0", env_kwargs={"goal_reward": 10.0}),),
         checks=(
             oscillates("narrow", GAUSS, 1.0),
@@ -100,21 +98,21 @@ TUNNEL_CLAIMS = (
         measures=("profile",),
         pictures_at=(1.0,),
         notes="The thesis raises the goal's reward from 0.1 to 1 and does not say what progress on "
-        "the way earns; what counts is their ratio. With ours, 1.36 for the whole way, a goal of 1 "
-        "lets Gauss settle after its first success: no swing in any of three tuning seeds (100 to "
-        "102, 50 000 steps), and none with a temperature rate of 1e-2 or a goal of 0.1 either. "
-        "With a goal of 10 all three swing, so it is 10 here. Progress scaled down to a tenth "
-        "instead slowed the agents down (first success of Gauss after 26 000 to 35 000 steps). "
-        "Seen afterwards: some Gauss seeds never reach the goal while training. Such a seed has "
-        "nothing to swing between, so being steady was made to demand that most seeds learn.",
+        "the way earns; their ratio matters. With ours, 1.36 for the whole way, a goal of 1 lets "
+        "Gauss settle after its first success: no swing in any of three tuning seeds (100 to 102, "
+        "50 000 steps), and none with a learning rate of 1e-2 for the entropy coefficient or a "
+        "goal of 0.1 either. With a goal of 10 all three swing, so it is 10 here. Scaling progress "
+        "down to a tenth instead slowed the agents down (first success of Gauss after 26 000 to 35 "
+        "000 steps). Observed afterwards: some Gauss seeds never reach the goal in training and so "
+        "cannot oscillate; steadiness therefore requires that most seeds learn.",
     ),
     Experiment(
         name="sparse-fixed-alpha",
         claim="E5",
         source="section 3.2.4, figures 3.2 and 3.10",
-        title="Straight tunnel with sparse reward, fixed temperature: along an axis or diagonally",
+        title="Straight tunnel with sparse reward, fixed entropy coefficient: axis and diagonal",
         thesis="Along an axis the agents do not differ, and all lose what they learned later on, "
-        "the temperature being a little too high. Diagonally Gauss fails; NF beats LR.",
+        "as the entropy coefficient is a little too high. Diagonally Gauss fails; NF beats LR.",
         settings=_SPARSE,
         checks=(
             *_HORIZONTAL_ALIKE,
@@ -125,19 +123,19 @@ TUNNEL_CLAIMS = (
             ordered("diagonal", "train_return", (FLOW, LOW_RANK)),
         ),
         pictures_at=(1.0,),
-        notes="Networks of two layers with 16 units (NF: 4), as in the thesis. What is not seen: "
-        "here LR is as good as NF on the diagonal, as both solve it in every seed, and nobody "
-        "loses along the axis what was learned (which has no line in the rule, as it is no merit "
-        "of any agent). The lines on equal returns along the axis and on NF above LR were added "
-        "after the runs; the thesis says both.",
+        notes="Networks of two layers with 16 units (NF: 4), as in the thesis. Not reproduced: "
+        "here LR is as good as NF on the diagonal, as both solve it in every seed, and no agent "
+        "loses along the axis what it has learned (which is not part of the rule, as it does not "
+        "distinguish the agents). The lines on equal returns along the axis and on NF above LR "
+        "were added after the runs; both are claims of the thesis.",
     ),
     Experiment(
         name="sparse-fixed-entropy",
         claim="E6",
         source="section 3.2.4, figure 3.11",
-        title="Straight tunnel with sparse reward, learned temperature",
-        thesis="The same picture, all agents a little worse than with the fixed temperature. "
-        "Gauss finds the diagonal goal now and then.",
+        title="Straight tunnel with sparse reward, learned entropy coefficient",
+        thesis="The same picture, all agents a little worse than with the fixed coefficient. Gauss "
+        "finds the diagonal goal now and then.",
         settings=tuple(Setting(s.name, s.env_id, overrides=LEARNED) for s in _SPARSE),
         checks=(
             *_HORIZONTAL_ALIKE,
@@ -148,10 +146,10 @@ TUNNEL_CLAIMS = (
             no_better_than("sparse-fixed-alpha", "diagonal", (LOW_RANK, FLOW)),
         ),
         pictures_at=(1.0,),
-        notes="An entropy of -2 nats is more than a tunnel of this width leaves room for: every "
-        "agent fails most training episodes, so their training success lies closer together than "
-        "the rule asks. Along the axis, the image of the flow's base mean is no good action at "
-        'that entropy: with `deterministic_mode="log_prob"` ten of ten other seeds solve it '
+        notes="An entropy of -2 nats is too high for a tunnel of this width: every agent fails "
+        "most training episodes, so their training successes differ by less than the rule "
+        "requires. Along the axis, the image of the flow's base mean is not a good action at that "
+        'entropy: with `deterministic_mode="log_prob"` ten of ten other seeds solve it '
         "(docs/guide/deterministic.md). The target is the thesis's and was not changed. The line "
         "on equal returns along the axis was added after the runs, as in sparse-fixed-alpha.",
     ),
@@ -159,7 +157,7 @@ TUNNEL_CLAIMS = (
         name="diagonal-dimensions",
         claim="D2-32",
         source="ours",
-        title="The diagonal tunnel in 2 to 32 dimensions: how far does each agent explore?",
+        title="The diagonal tunnel in 2 to 32 dimensions: up to which one does each agent learn?",
         thesis="Not in the thesis. The share of directions that stay in the tunnel shrinks with "
         "every dimension, for independent noise much faster than for correlated noise.",
         settings=tuple(
@@ -176,11 +174,11 @@ TUNNEL_CLAIMS = (
             for agent in (LOW_RANK, FLOW)
         ),
         notes="Everything but the number of dimensions is as in sparse-fixed-alpha, including the "
-        "tunnel's width. There is no claim to reproduce: each line says whether that agent still "
-        "gets there. Of independent uniform actions 8.6 % stay inside with two dimensions, 0.02 % "
-        "with four, and fewer than one in 400 000 with eight: a correlation cannot be learned from "
-        "steps that never happen. Tried on three other seeds (100 to 102, 40 000 steps): a width "
-        "that lets 8.6 % of them stay with eight dimensions. NF solved it in none of them, Gauss "
-        "in one.",
+        "tunnel's width. There is no claim to reproduce: each line states whether that agent still "
+        "solves the task. Of independent uniform actions 8.6 % stay inside with two dimensions, "
+        "0.02 % with four, and fewer than one in 400 000 with eight: a correlation cannot be "
+        "learned from steps that never happen. A wider tunnel, in which 8.6 % stay inside with "
+        "eight dimensions, was tried on three other seeds (100 to 102, 40 000 steps): NF solved it "
+        "in none of them, Gauss in one.",
     ),
 )

@@ -1,4 +1,4 @@
-"""From an experiment to work items: one item is one agent on one setting, with its seeds."""
+"""Work items, one per agent and setting of an experiment, and how long they take."""
 
 from __future__ import annotations
 
@@ -12,14 +12,33 @@ import gymnasium as gym
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.experiments.experiment import Agent, Experiment, Setting
+from sb3_flowpolicy.experiments.store import SCHEMA
 
 FIRST_SEED = 1
 SEEDS_PER_ITEM = 10
 QUICK_STEPS, QUICK_SEEDS = 3000, 2
 # Short runs write this many checkpoints, long ones one per so many steps.
 CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS = 6, 50_000
-# Raised whenever the files of a run change their meaning.
-SCHEMA = 1
+
+STEPS_PER_SECOND = {
+    16: {"sac_gauss": 3300.0, "sac_lowrank": 2450.0, "sac_flow": 2400.0},
+    128: {"sac_gauss": 390.0, "sac_lowrank": 370.0, "sac_flow": 340.0},
+    256: {"sac_gauss": 105.0, "sac_lowrank": 103.0, "sac_flow": 99.0},
+}
+"""Units of the critics' layers -> agent -> steps per second, summed over ten seeds of one process
+with one thread, on one of two idle cores of an AMD EPYC (docs/benchmarks.md).
+
+16: ``learn()`` of ten seeds; for sac_lowrank, sac_gauss's rate times their ratio as single agents.
+128 and 256: updates of single agents, as stacking does not speed up large matrix products. All
+blocks do one update per step, which dominates the time. The real times of a run are in its
+``.done.json`` files.
+"""
+
+GSDE_STEPS_PER_SECOND = 250.0
+"""gSDE runs in SB3's own loop, one seed after the other, at this speed for all small networks."""
+
+_START_SECONDS = 40
+"""Starting a process and compiling."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +55,7 @@ class WorkItem:
         hyperparameters: Arguments of the agents, ``policy`` among them.
         steps: Environment steps per seed.
         eval_every: Steps between two measurements.
-        checkpoint_every: Steps between two checkpoints; running episodes end there.
+        checkpoint_every: Steps between two checkpoints, a multiple of ``eval_every``.
         test_episodes: Test episodes per seed and measurement.
         measures: Names of further measurements.
         pictures_at: Steps after which the first seed's policy is recorded.
@@ -66,7 +85,7 @@ class WorkItem:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that a run of an experiment will do."""
+    """All work items of a run."""
 
     experiment: Experiment
     steps: int
@@ -74,7 +93,7 @@ class Plan:
     items: tuple[WorkItem, ...]
 
     def settings(self) -> dict[str, Any]:
-        """Return what results depend on; two runs share a folder only if these are equal."""
+        """Return everything that results depend on; runs that share a folder agree on it."""
         return {
             "schema": SCHEMA,
             "experiment": self.experiment.name,
@@ -96,7 +115,7 @@ def make_plan(
 
     Args:
         experiment: The experiment.
-        profile: ``"full"`` for the experiment's own steps and seeds, ``"quick"`` for a try-out.
+        profile: ``"full"`` for the experiment's own steps and seeds, ``"quick"`` for a trial.
         steps: Environment steps per seed. Default: the profile's.
         seeds: Number of seeds. Default: the profile's.
         first_seed: The seeds are this one and those after it.
@@ -109,8 +128,6 @@ def make_plan(
     Raises:
         ValueError: If an argument is out of range.
     """
-    if profile not in ("full", "quick"):
-        raise ValueError(f'profile must be "full" or "quick", got {profile!r}')
     quick = profile == "quick"
     steps = (QUICK_STEPS if quick else experiment.steps) if steps is None else steps
     seeds = (QUICK_SEEDS if quick else experiment.seeds) if seeds is None else seeds
@@ -118,8 +135,6 @@ def make_plan(
     for name, (value, bound) in {**least, "first_seed": (first_seed, 0)}.items():
         if value < bound:
             raise ValueError(f"{name} must be at least {bound}, got {value}")
-    if first_seed + seeds > 2**32:
-        raise ValueError(f"first_seed must leave seeds below {2**32}, got {first_seed}")
     chosen = tuple(range(first_seed, first_seed + seeds))
     groups = [chosen[i : i + seeds_per_item] for i in range(0, seeds, seeds_per_item)]
     items = [
@@ -203,7 +218,7 @@ def describe(item: WorkItem) -> dict[str, Any]:
 def environment(item: WorkItem) -> str:
     """Return the id of the item's environment, registered with its arguments if need be.
 
-    An id, not a factory: only ids lead to an environment's vectorised form.
+    An id, not a factory: only ids lead to an environment's vectorized form.
     """
     register_env(item.env_id)
     if not item.env_kwargs:
@@ -220,3 +235,38 @@ def environment(item: WorkItem) -> str:
             kwargs={**base.kwargs, **item.env_kwargs},
         )
     return name
+
+
+def item_seconds(item: WorkItem) -> float:
+    """Estimate the time of an item on one core, seconds."""
+    settings = item.hyperparameters
+    net_arch = settings.get("policy_kwargs", {}).get("net_arch", [256, 256])
+    critic = net_arch["qf"] if isinstance(net_arch, dict) else net_arch
+    width = min(STEPS_PER_SECOND, key=lambda known: abs(known - max(critic)))
+    algo = {"GaussPolicy": "sac_gauss", "LowRankPolicy": "sac_lowrank"}.get(
+        settings["policy"], "sac_flow"
+    )
+    speed = STEPS_PER_SECOND[width][algo]
+    if settings.get("use_sde"):
+        speed = min(speed, GSDE_STEPS_PER_SECOND)
+    return _START_SECONDS + item.steps * len(item.seeds) / speed
+
+
+def plan_seconds(plan: Plan, workers: int) -> float:
+    """Estimate the time of a plan: each free worker takes the longest remaining item."""
+    loads = [0.0] * max(1, workers)
+    for seconds in sorted((item_seconds(item) for item in plan.items), reverse=True):
+        loads[loads.index(min(loads))] += seconds
+    return max(loads)
+
+
+def in_words(seconds: float) -> str:
+    """Return a rounded time.
+
+    Example:
+        >>> in_words(95), in_words(5000), in_words(200_000)
+        ('2 min', '1.4 h', '2.3 days')
+    """
+    if seconds < 3600:
+        return f"{max(1, round(seconds / 60))} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 86_400 else f"{seconds / 86_400:.1f} days"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,44 +15,61 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
+# Checkpoints of a run, besides those after each evaluation and at the end.
+CHECKPOINTS = 10
+
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, evaluate and save as the command line says.
+    """Train, evaluate and save agents.
 
     Args:
         arguments: Command line without the program's name. Default: that of the process.
 
     Raises:
-        ValueError: If an argument is out of range.
+        ValueError: If an argument is out of range, or there is a run already in the folder.
     """
     args = _parser().parse_args(arguments)
     th.set_num_threads(args.num_threads)
     folder = Path(args.log_folder, args.algo, f"{args.env}_seeds")
+    checkpoints = folder / "checkpoints"
     if args.resume:
-        batch = SeedBatch.load(folder, args.env, monitor_dir=None)
-        done = batch.models[0].num_timesteps
+        batch = SeedBatch.resume(checkpoints, args.env, monitor_dir=folder)
+    elif checkpoints.exists():
+        raise ValueError(f"{folder} must be new, or --resume given to continue the run in it")
     else:
-        batch, done = _new_batch(args, folder), 0
+        batch = _new_batch(args, folder)
     total = args.n_timesteps or load_hyperparameters(args.algo, args.env)["n_timesteps"]
-    print(f"{args.algo} on {args.env}, seeds {batch.seeds}: {total - done} steps each", flush=True)
-    while done < total:
-        stage = min(args.eval_freq or total, total - done)
-        batch.learn(
-            stage,
-            tb_log_name=f"{args.algo}_{args.env}",
-            reset_num_timesteps=not done,
-            progress_bar=args.progress,
-        )
-        done += stage
+    every = args.eval_freq or total
+    done, first = batch.models[0].num_timesteps, True
+    end = min(max(1, math.ceil(done / every)) * every, total)
+    left = max(0, total - done)
+    print(f"{args.algo} on {args.env}, seeds {batch.seeds}: {left} steps each", flush=True)
+    while True:
+        if done < end:
+            batch.learn(
+                # The first call counts from zero, that of a resumed batch included.
+                end if first else end - done,
+                tb_log_name=f"{args.algo}_{args.env}",
+                reset_num_timesteps=first,
+                progress_bar=args.progress,
+                checkpoint_every=max(1, total // CHECKPOINTS),
+                checkpoint_path=checkpoints,
+            )
+            done, first = batch.models[0].num_timesteps, False
+        returns = _test_returns(batch, args.env, args.eval_episodes)
         if args.eval_freq:
-            returns = _test_returns(batch, args.env, args.eval_episodes)
-            _append(folder / "evaluations.csv", batch.seeds, done, returns)
+            _record(folder / "evaluations.csv", batch.seeds, done, returns)
             print(f"  step {done:<8} test return {np.mean(returns):8.2f}", flush=True)
-    batch.save(folder)
-    _report(batch, args.env, args.eval_episodes)
+        if end >= total:
+            break
+        end = min(end + every, total)
+    for seed, model in zip(batch.seeds, batch.models, strict=True):
+        model.save(folder / f"seed_{seed}.zip")
+    _report(batch.seeds, returns)
     print(f"Saved to {folder}")
 
 
@@ -73,14 +91,13 @@ def _overrides(pairs: list[str]) -> dict[str, Any]:
     """Read ``key:value``, the value as YAML."""
     settings = {}
     for pair in pairs:
-        key, separator, value = pair.partition(":")
-        if not separator:
-            raise ValueError(f"hyperparams must be of the form key:value, got {pair!r}")
         try:
+            key, value = pair.split(":", maxsplit=1)
             settings[key] = yaml.safe_load(value)
-        # Recursion: brackets in brackets in brackets ...
         except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-            raise ValueError(f"hyperparams must have YAML values, got {pair[:80]!r}") from error
+            raise ValueError(
+                f"hyperparams must be of the form key:value, the value in YAML, got {pair[:80]!r}"
+            ) from error
     return settings
 
 
@@ -95,26 +112,23 @@ def _test_returns(batch: SeedBatch, env_id: str, n_episodes: int) -> np.ndarray:
     return np.asarray(returns)
 
 
-def _append(path: Path, seeds: list[int], step: int, returns: np.ndarray) -> None:
-    """Append a row per seed to the file of evaluations."""
-    rows = [
-        f"{seed},{step},{row.mean():.6g},{row.std():.6g}\n"
+def _record(path: Path, seeds: list[int], step: int, returns: np.ndarray) -> None:
+    """Add a row per seed to the evaluations; those of a step that is repeated are replaced."""
+    rows = path.read_text().splitlines() if path.exists() else ["seed,step,test_return,std"]
+    rows[1:] = [row for row in rows[1:] if int(row.split(",")[1]) < step]
+    rows += [
+        f"{seed},{step},{row.mean():.6g},{row.std():.6g}"
         for seed, row in zip(seeds, returns, strict=True)
     ]
-    known = path.read_text() if path.exists() else "seed,step,test_return,std\n"
-    # Written whole, then renamed: an interrupted run leaves no half rows.
-    draft = path.with_suffix(".tmp")
-    draft.write_text(known + "".join(rows))
-    draft.replace(path)
+    write_text(path, "\n".join(rows) + "\n")
 
 
-def _report(batch: SeedBatch, env_id: str, n_episodes: int) -> None:
-    """Print the test return of each seed, the best and the worst alike."""
-    returns = _test_returns(batch, env_id, n_episodes)
-    for seed, row in zip(batch.seeds, returns, strict=True):
+def _report(seeds: list[int], returns: np.ndarray) -> None:
+    """Print the test return of each seed and of all."""
+    for seed, row in zip(seeds, returns, strict=True):
         print(
             f"  seed {seed:<4} test return {row.mean():8.2f} +/- {row.std():.2f} "
-            f"({n_episodes} episodes)"
+            f"({len(row)} episodes)"
         )
     means = returns.mean(axis=1)
     print(f"  all       test return {np.mean(means):8.2f} +/- {np.std(means):.2f} over seeds")
@@ -123,7 +137,7 @@ def _report(batch: SeedBatch, env_id: str, n_episodes: int) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.seeds",
-        description="Train several seeds of an agent at once, for little more than the price of "
+        description="Train several seeds of an agent at once, for little more than the cost of "
         "one, with the hyperparameters that rl_zoo3 would use.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
@@ -138,9 +152,14 @@ def _parser() -> argparse.ArgumentParser:
     add("-tb", "--tensorboard-log", help="TensorBoard folder, one run per seed")
     add("--eval-episodes", type=int, default=20, help="test episodes per seed at the end")
     add("--eval-freq", type=int, help="steps between tests, written to evaluations.csv")
-    add("--num-threads", type=int, default=1, help="torch threads; small networks like one best")
+    add(
+        "--num-threads",
+        type=int,
+        default=1,
+        help="torch threads; one is fastest for small networks",
+    )
     add("-P", "--progress", action="store_true", help="show a progress bar")
-    add("--resume", action="store_true", help="go on with the saved batch, up to n-timesteps")
+    add("--resume", action="store_true", help="continue the run in the folder, up to n-timesteps")
     return parser
 
 

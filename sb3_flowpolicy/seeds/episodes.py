@@ -1,4 +1,4 @@
-"""What SB3's Monitor and logger know about episodes, for S environments stepped at once."""
+"""Episode statistics as in SB3's Monitor and logger, for S environments stepped at once."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
 
 
 class SeedEpisodes:
-    """Counts returns and lengths of S running episodes, and tells models of finished ones.
+    """Sums up S running episodes, and records finished ones in models and monitor files.
 
     Args:
         models: One model per environment.
         seeds: Their seeds, for file names.
-        before_dump: Called with an index just before that model's log is written.
+        before_dump: Called with a model's index just before its log is written.
         monitor_dir: Folder for ``seed_<seed>.monitor.csv``; None writes none.
-        info_keywords: What else to note of an episode, from the info of its last step.
+        info_keywords: Further numbers to record, from the info of an episode's last step.
     """
 
     def __init__(
@@ -59,22 +59,14 @@ class SeedEpisodes:
         Args:
             rewards: Rewards, (S,).
             dones: Which episodes ended, (S,).
-            infos: Infos of a vectorised environment that resets in the same step.
-            log_interval: Episodes between two dumps of a model's log; None dumps none.
-
-        Raises:
-            ValueError: If an info keyword is not in the infos.
+            infos: Infos of a vectorized environment that resets in the same step.
+            log_interval: Episodes between two dumps of a model's log; None for no dumps.
         """
         self.returns += rewards
         self.lengths += 1
         if not dones.any():
             return
         final_info = infos.get("final_info", {})
-        unknown = [name for name in self.info_keywords if name not in final_info]
-        if unknown:
-            raise ValueError(
-                f"info_keywords must be in the info of an episode's last step, got {unknown}"
-            )
         success = final_info.get("is_success")
         for seed in np.flatnonzero(dones).tolist():
             model = self.models[seed]
@@ -93,7 +85,6 @@ class SeedEpisodes:
                 self.writers[seed].write_row(episode)
             model._episode_num += 1
             due = log_interval is not None and model._episode_num % log_interval == 0
-            # Where the logger has nowhere to write to, there is nothing to put together.
             if due and model.logger.output_formats:
                 self.before_dump(seed)
                 model.dump_logs()
@@ -106,7 +97,7 @@ class SeedEpisodes:
         self.lengths[:] = 0
 
     def state(self) -> dict[str, Any]:
-        """Return what is needed to go on with the running episodes."""
+        """Return everything needed to continue the running episodes."""
         return {
             "returns": self.returns,
             "lengths": self.lengths,
@@ -115,7 +106,7 @@ class SeedEpisodes:
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state` was taken."""
+        """Restore what :meth:`state` returned."""
         self.returns, self.lengths = state["returns"], state["lengths"]
         self.start = state["start"]
         write_texts(self._files(), state["texts"])

@@ -1,4 +1,4 @@
-"""What a batch of seeds needs before it can start: fitting agents, environments, a progress bar."""
+"""Agents, environments and callbacks that a batch of seeds can work with."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.engine import why_unsupported
 
 EnvFactory = Callable[[], gym.Env]
-
-
 CallbackFactory = Callable[[int], BaseCallback]
 
 
@@ -28,17 +26,12 @@ def check_seeds(seeds: int | Iterable[int]) -> list[int]:
     """Return the seeds as a list.
 
     Raises:
-        ValueError: If there are none, or they are not different integers of at least 0.
+        TypeError: If they are not integers.
+        ValueError: If there are none, or they are equal or negative.
     """
-    try:
-        # A number of seeds, numpy's integers included, or the seeds themselves.
-        listed = (
-            [operator.index(seed) for seed in seeds]
-            if isinstance(seeds, Iterable)
-            else list(range(operator.index(seeds)))
-        )
-    except TypeError as error:
-        raise ValueError(f"seeds must be integers, got {seeds!r}") from error
+    # ``index`` accepts numpy's integers, too.
+    many = seeds if isinstance(seeds, Iterable) else range(operator.index(seeds))
+    listed = [operator.index(seed) for seed in many]
     if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
         raise ValueError(f"seeds must be different, at least 0 and at least one, got {seeds!r}")
     return listed
@@ -47,7 +40,7 @@ def check_seeds(seeds: int | Iterable[int]) -> list[int]:
 def copy_callback(
     callback: BaseCallback | list[BaseCallback] | CallbackFactory | None, seed: int
 ) -> BaseCallback | None:
-    """Return one agent's own callback: callbacks hold the state of the agent they watch."""
+    """Return a callback for one agent only, as callbacks hold state of the agent they watch."""
     if isinstance(callback, BaseCallback):
         return copy.deepcopy(callback)
     if isinstance(callback, list):
@@ -86,27 +79,19 @@ def make_env(env: str | EnvFactory) -> gym.Env:
 
 
 def make_vec_env(env: str | EnvFactory, count: int) -> VectorEnv:
-    """Make the environment's own vectorised form, or ``count`` of them stepped one by one.
+    """Make the environment's own vectorized form, or ``count`` of them stepped one by one.
 
-    Either way an episode that ends is followed by the next one in the same step.
+    An episode that ends is followed by the next one in the same step.
     """
     mode = AutoresetMode.SAME_STEP
     if isinstance(env, str) and gym.spec(env).vector_entry_point is not None:
-        return gym.make_vec(
-            env,
-            num_envs=count,
-            vectorization_mode="vector_entry_point",
-            autoreset_mode=mode,
-        )
+        form = "vector_entry_point"
+        return gym.make_vec(env, num_envs=count, vectorization_mode=form, autoreset_mode=mode)
     return SyncVectorEnv([partial(make_env, env)] * count, autoreset_mode=mode)
 
 
 def make_progress_bar(total: int) -> Any:
-    """Return the progress bar that SB3 uses.
-
-    Raises:
-        ImportError: If tqdm or rich is missing.
-    """
+    """Return the progress bar that SB3 uses; raise ``ImportError`` if it is not installed."""
     if callbacks.tqdm is None:
         raise ImportError('the progress bar needs tqdm and rich: pip install "sb3_flowpolicy[zoo]"')
     return callbacks.tqdm(total=total)

@@ -11,15 +11,14 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_flowpolicy.engine.replay import ReplayRows, is_plain
 from sb3_flowpolicy.engine.update import Batch
 
-# Random numbers are drawn for this many updates or steps at once: a call per seed costs as much
-# for one as for many.
+# Random numbers are drawn for this many updates or steps at once, as each call has a fixed cost.
 AHEAD = 64
 
 
 class SeedStorage:
     """Replay buffers of S models as one: written once per step, read with one gather.
 
-    The models' own buffers become views, so that each of them can be saved like any other.
+    The models' own buffers become views of it, and can be saved as usual.
 
     Args:
         buffers: One buffer per seed, equally filled: plain SB3 buffers of one environment.
@@ -54,31 +53,24 @@ class SeedStorage:
         self.full = self.full or self.pos == 0
 
     def synchronize(self) -> None:
-        """Take over what the models' own buffers were given, demonstrations for example.
-
-        Raises:
-            ValueError: If they are filled differently.
-        """
+        """Continue where the models' own buffers end, after demonstrations for example."""
         if len({(buffer.pos, buffer.full) for buffer in self.buffers}) > 1:
             sizes = [buffer.size() for buffer in self.buffers]
             raise ValueError(f"replay buffers must be equally filled, got {sizes} transitions")
         self.pos, self.full = self.buffers[0].pos, self.buffers[0].full
 
     def publish(self) -> None:
-        """Tell the models' own buffers how full they are."""
+        """Set the positions of the models' own buffers."""
         for buffer in self.buffers:
             buffer.pos, buffer.full = self.pos, self.full
 
     def gather(self, uniform: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
-        """Return minibatches.
+        """Return n minibatches.
 
         Args:
-            uniform: Which transitions, as numbers in [0, 1), (n, S, B).
+            uniform: Transitions as fractions of the buffer, in [0, 1), (n, S, B).
             gamma: Discount factor.
             noise: Standard normals, (n, 2, S, B, M).
-
-        Returns:
-            n batches.
         """
         index = (uniform * len(self)).long().mul_(len(self.buffers)).add_(self._seeds)
         return self.rows.take(index, gamma, noise)
@@ -87,12 +79,12 @@ class SeedStorage:
 class SeedNoise:
     """Random numbers of S seeds, each from a generator of its own.
 
-    What a seed draws does not depend on which other seeds it shares a batch with.
+    A seed's numbers do not depend on the other seeds of its batch.
 
     Args:
         seeds: The seeds.
-        shape: Shape of what one seed needs at a time.
-        stream: Tells apart several uses by the same seed.
+        shape: Shape of one draw of one seed.
+        stream: Distinguishes several uses by the same seed.
         uniform: Whether to draw from [0, 1) instead of a standard normal.
     """
 
@@ -113,7 +105,7 @@ class SeedNoise:
     def draw(self) -> th.Tensor:
         """Return the next numbers of every seed, (S, *shape)."""
         if self._next == AHEAD:
-            # Uniform numbers become indices: float32 would miss some of a million rows.
+            # Uniform numbers become indices; float32 cannot represent all of a million rows.
             draw, dtype = (th.rand, th.float64) if self.uniform else (th.randn, th.float32)
             self._pool = th.stack(
                 [draw(AHEAD, *self.shape, generator=own, dtype=dtype) for own in self.generators], 1
@@ -130,12 +122,12 @@ class SeedNoise:
         )
 
     def state(self) -> dict[str, object]:
-        """Return what is needed to go on with the same numbers."""
+        """Return everything needed to continue with the same numbers."""
         states = [generator.get_state() for generator in self.generators]
         return {"generators": states, "pool": self._pool, "next": self._next}
 
     def set_state(self, state: dict[str, object]) -> None:
-        """Go on where :meth:`state` was taken."""
+        """Restore what :meth:`state` returned."""
         for generator, saved in zip(self.generators, state["generators"], strict=True):  # type: ignore[call-overload]
             generator.set_state(saved)
         self._pool, self._next = state["pool"], state["next"]  # type: ignore[assignment]

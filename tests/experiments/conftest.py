@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_flowpolicy.experiments.counts import mostly_fails, none_fails
+from sb3_flowpolicy.experiments.checks import mostly_fails, none_fails
 from sb3_flowpolicy.experiments.experiment import FLOW, GAUSS, Experiment, Setting
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
-from sb3_flowpolicy.experiments.settings_file import claim_folder
-from sb3_flowpolicy.experiments.store import ItemFiles
+from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
 from sb3_flowpolicy.experiments.work import Plan, make_plan
 
 FAST = {

@@ -14,10 +14,9 @@ import pytest
 from sb3_flowpolicy.experiments.__main__ import main
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import GAUSS, NOT_MEASURED, Experiment
-from sb3_flowpolicy.experiments.integrity import reservation
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
-from sb3_flowpolicy.experiments.settings_file import read_settings
-from sb3_flowpolicy.experiments.store import ItemFiles
+from sb3_flowpolicy.experiments.section import reservation
+from sb3_flowpolicy.experiments.store import ItemFiles, read_settings
 from sb3_flowpolicy.experiments.work import make_plan
 from tests.experiments.conftest import MakeUp, declare_whole
 
@@ -53,25 +52,16 @@ def _head_only(lines: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (_without_seed, "must hold seed 2 up to step 60000, got none"),
-        (_without_end, "must hold seed 2 up to step 60000, got 59500"),
-        (_out_of_order, "must hold increasing steps, seed 1 does not"),
-        (_other_seed, r"must hold seeds \[1, 2\], got 7"),
-        (_half_a_seed, r"must hold seeds \[1, 2\], got 1\.5"),
-        (_nothing, "must hold seed 1 up to step 60000, got none"),
-        (_head_only, "must hold seed 1 up to step 60000, got none"),
-    ],
+    "change",
+    [_without_seed, _without_end, _out_of_order, _other_seed, _half_a_seed, _nothing, _head_only],
 )
 def test_rows_that_are_missing_or_odd_are_noticed(
-    change: Callable[[list[str]], list[str]], message: str, make_up: MakeUp, tmp_path: Path
+    change: Callable[[list[str]], list[str]], make_up: MakeUp, tmp_path: Path
 ) -> None:
     make_up(NAME, seeds=2)
     files = ItemFiles(tmp_path / NAME, "narrow-flow")
     files.table.write_text("".join(change(files.table.read_text().splitlines(keepends=True))))
-    declare_whole(files)
-    with pytest.raises(ValueError, match=rf"narrow-flow\.csv {message}"):
+    with pytest.raises(ValueError, match=r"narrow-flow\.csv .*must hold"):
         Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
 
 
@@ -87,8 +77,8 @@ def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -
     ("facts", "message"),
     [
         ({"key": "narrow-gauss"}, "must be of narrow-flow, got 'narrow-gauss'"),
-        ({"seeds": [9, 1]}, r"must tell of seeds \[1, 2\], got \[9, 1\]"),
-        ({"steps": 5000}, "must tell of 60000 steps, got 5000"),
+        ({"seeds": [9, 1]}, r"must be of 60000 steps of seeds \[1, 2\], got 60000 of \[9, 1\]"),
+        ({"steps": 5000}, r"must be of 60000 steps of seeds \[1, 2\], got 5000 of \[1, 2\]"),
     ],
 )
 def test_facts_of_something_else_are_noticed(
@@ -109,7 +99,9 @@ def test_a_run_does_not_build_on_damage(
     assert main(command) == 0
     (tmp_path / NAME / "narrow-flow.csv").unlink()
     assert main(command) == 1
-    assert "narrow-flow.csv must hold seed 1 up to step 60000, got none" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "narrow-flow.csv must hold the" in error
+    assert "bytes written to it, got 0" in error
 
 
 @pytest.mark.parametrize(
@@ -152,8 +144,7 @@ def test_a_detail_without_its_fields_is_named(line: str, tmp_path: Path) -> None
     ("change", "message"),
     [
         ({"schema": 99}, "must be of schema 1, got 99"),
-        ({"experiment": "move"}, "called like its experiment, 'move', got 'circle-narrow'"),
-        ({"seeds": ["1"]}, r"must hold whole numbers as seeds, got \['1'\]"),
+        ({"experiment": "move"}, "named after its experiment, 'move', got 'circle-narrow'"),
         ({"items": {"x": {}}}, r"settings\.json: x must hold 'setting' \(str\), got {}"),
     ],
 )
@@ -177,7 +168,7 @@ def test_results_that_are_not_the_experiments_own_are_marked() -> None:
     assert said() is None
     assert said(seeds=12) is None
     assert said(seeds_per_item=4) is None
-    assert said(steps=100) == "try-out, not a result"
+    assert said(steps=100) == "trial, not a result"
     assert said(first_seed=100) == "seeds from 100 on, which are for tuning: not a result"
     other = json.loads(json.dumps(make_plan(experiment).settings()))
     other["items"]["narrow-flow"]["hyperparameters"]["gamma"] = 0.5
@@ -193,8 +184,8 @@ def test_an_agent_that_was_added_later_leaves_the_claim_open(
     grown = replace(find(NAME), agents=(*find(NAME).agents, replace(GAUSS, name="late")))
     monkeypatch.setitem(EXPERIMENTS, NAME, grown)
     evidence = Evidence(grown, tmp_path / NAME)
-    assert grown.judge(evidence)[0] == NOT_MEASURED
-    assert reservation(grown, evidence.settings or {}) == "try-out, not a result"
+    assert evidence.judge()[0] == NOT_MEASURED
+    assert reservation(grown, evidence.settings or {}) == "trial, not a result"
 
 
 def test_what_was_not_measured_leaves_the_claim_open(make_up: MakeUp, tmp_path: Path) -> None:
@@ -203,7 +194,7 @@ def test_what_was_not_measured_leaves_the_claim_open(make_up: MakeUp, tmp_path: 
         path.unlink()
         declare_whole(ItemFiles(path.parent, path.name.removesuffix(".details.jsonl")))
     experiment = find("circle-fixed-entropy")
-    verdict, findings = experiment.judge(Evidence(experiment, tmp_path / experiment.name))
+    verdict, findings = Evidence(experiment, tmp_path / experiment.name).judge()
     assert verdict == NOT_MEASURED
     assert findings[2].measured == "profile of gauss on circle was not measured"
 
@@ -227,7 +218,7 @@ def test_three_times_the_bar_reaches_the_bar(make_up: MakeUp, tmp_path: Path) ->
 
 def test_who_learns_nothing_is_not_steady(make_up: MakeUp, tmp_path: Path) -> None:
     make_up(NAME, {"flow": 0.0})
-    _, findings = find(NAME).judge(Evidence(find(NAME), tmp_path / NAME))
+    _, findings = Evidence(find(NAME), tmp_path / NAME).judge()
     assert [finding.holds for finding in findings] == [False, True, False]
     assert "0 of 10 ever succeed in training" in findings[2].measured
 

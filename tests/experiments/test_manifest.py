@@ -10,10 +10,15 @@ import numpy as np
 import pytest
 
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
-from sb3_flowpolicy.experiments.costs import in_words, item_seconds, plan_seconds
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
-from sb3_flowpolicy.experiments.work import environment, make_plan
+from sb3_flowpolicy.experiments.work import (
+    environment,
+    in_words,
+    item_seconds,
+    make_plan,
+    plan_seconds,
+)
 
 
 def test_all_claims_are_there() -> None:

@@ -20,10 +20,9 @@ from sb3_flowpolicy.experiments.experiment import (
     PARTLY,
     REPRODUCED,
 )
+from sb3_flowpolicy.experiments.figures import outcomes_figure
 from sb3_flowpolicy.experiments.manifest import find
-from sb3_flowpolicy.experiments.markdown import write_docs
-from sb3_flowpolicy.experiments.outcomes import outcomes_figure
-from sb3_flowpolicy.experiments.report import write_report
+from sb3_flowpolicy.experiments.report import write_docs, write_report
 from sb3_flowpolicy.experiments.section import Section, read_results
 from sb3_flowpolicy.experiments.store import ItemFiles
 from tests.experiments.conftest import MakeUp, declare_whole
@@ -58,7 +57,7 @@ def test_a_rule_is_the_sum_of_its_checks(
     levels: dict[str, float], verdict: str, make_up: MakeUp, tmp_path: Path
 ) -> None:
     make_up("sparse-fixed-alpha", levels or {"nobody": 0.0})
-    found, findings = find("sparse-fixed-alpha").judge(evidence("sparse-fixed-alpha", tmp_path))
+    found, findings = evidence("sparse-fixed-alpha", tmp_path).judge()
     assert found == verdict
     counted = [finding for finding in findings if " of 10" in finding.measured]
     for finding, (path, agent) in zip(
@@ -73,11 +72,11 @@ def test_a_rule_is_the_sum_of_its_checks(
 def test_verdicts_of_the_circle(make_up: MakeUp, tmp_path: Path) -> None:
     levels = {"gauss": 0.95, "lowrank": 1.0, "flow": 1.05, "flow-default-init": 0.0}
     make_up("circle-fixed-alpha", levels)
-    verdict, _ = find("circle-fixed-alpha").judge(evidence("circle-fixed-alpha", tmp_path))
+    verdict, _ = evidence("circle-fixed-alpha", tmp_path).judge()
     assert verdict == REPRODUCED
     shutil.rmtree(tmp_path / "circle-fixed-alpha")
     make_up("circle-fixed-alpha", {"gauss": 1.5, "lowrank": 0.0, "flow": 0.0})
-    verdict, findings = find("circle-fixed-alpha").judge(evidence("circle-fixed-alpha", tmp_path))
+    verdict, findings = evidence("circle-fixed-alpha", tmp_path).judge()
     assert verdict == NOT_REPRODUCED
     assert findings[-1].measured == "0 of 10"
 
@@ -85,7 +84,7 @@ def test_verdicts_of_the_circle(make_up: MakeUp, tmp_path: Path) -> None:
 def test_what_did_not_finish_is_not_judged(make_up: MakeUp, tmp_path: Path) -> None:
     plan = make_up("circle-narrow")
     ItemFiles(tmp_path / "circle-narrow", plan.items[0].key).done.unlink()
-    verdict, _ = find("circle-narrow").judge(evidence("circle-narrow", tmp_path))
+    verdict, _ = evidence("circle-narrow", tmp_path).judge()
     assert verdict == NOT_MEASURED
 
 
@@ -100,7 +99,7 @@ def test_a_seed_that_fails_is_counted(make_up: MakeUp, tmp_path: Path) -> None:
     found = evidence("circle-fixed-alpha", tmp_path)
     assert found.solved("circle", "flow").sum() == 9
     assert found.steps_until_solved("circle", "flow").tolist()[2] == 60_000
-    _, findings = find("circle-fixed-alpha").judge(found)
+    _, findings = found.judge()
     assert findings[-1].holds is False
     assert findings[-1].measured == "9 of 10"
 
@@ -139,7 +138,7 @@ def test_outcomes_are_counted_per_agent_and_setting(make_up: MakeUp, tmp_path: P
 def test_a_try_out_is_no_result(make_up: MakeUp, tmp_path: Path) -> None:
     make_up("sparse-fixed-entropy", seeds=3)
     section = Section(evidence("sparse-fixed-entropy", tmp_path))
-    assert section.reservation == "try-out, not a result"
+    assert section.reservation == "trial, not a result"
     make_up("circle-narrow")
     assert Section(evidence("circle-narrow", tmp_path)).reservation is None
 
@@ -174,7 +173,7 @@ def test_docs_hold_tables_figures_and_data(make_up: MakeUp, tmp_path: Path) -> N
         assert (docs / link).read_bytes().startswith(b"\x89PNG")
     assert len(re.findall(r"!\[circle-fixed-entropy", text)) == 3
     assert f"| circle | {GAUSS.label} | 3 |" in text
-    assert "try-out, not a result" in text
+    assert "trial, not a result" in text
     # What is committed is enough to make the page again.
     again = [one.experiment.name for one in read_results(docs / "experiments") if one.complete]
     assert again == ["circle-fixed-entropy"]

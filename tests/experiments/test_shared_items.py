@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_flowpolicy.experiments import shared_items
+from sb3_flowpolicy.experiments import runner
 from sb3_flowpolicy.experiments.__main__ import main
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import GAUSS, LOW_RANK, Experiment
@@ -31,7 +31,7 @@ def _at(commit: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     def machine() -> dict:
         return {"commit": commit, "versions": {"torch": "2"}}
 
-    monkeypatch.setattr(shared_items, "machine", machine)
+    monkeypatch.setattr(runner, "machine", machine)
 
 
 def _run_tiny(out: Path) -> None:
@@ -88,4 +88,4 @@ def test_a_shortened_file_is_not_taken(
 
 def _adopted(experiment: Experiment, out: Path) -> dict[str, str]:
     (out / experiment.name).mkdir()
-    return shared_items.adopt(out / experiment.name, make_plan(experiment).items)
+    return runner.adopt(out / experiment.name, make_plan(experiment).items)

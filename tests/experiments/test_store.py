@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from sb3_flowpolicy.common.files import write_json
-from sb3_flowpolicy.experiments.settings_file import claim_folder
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, claim_folder
 
 ROW = dict.fromkeys(BASIC_COLUMNS, 0.25) | {"seed": 1, "step": 100, "train_success": None}
 

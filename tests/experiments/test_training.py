@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from filelock import FileLock
 
+from sb3_flowpolicy.checkpoint import state
+from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.machine import machine
+from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.experiments import training
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.training import run_item
 from sb3_flowpolicy.experiments.work import WorkItem, make_plan, merge
+from sb3_flowpolicy.seeds.experience import SeedExperience
 
 
 @pytest.fixture
@@ -70,14 +76,17 @@ class Crash(BaseException):
 GSDE = {"policy": "GaussPolicy", "use_sde": True, "train_freq": 8, "gradient_steps": 8}
 
 
-@pytest.mark.parametrize(("crashes", "overrides"), [([0, 3], {}), ([1, 1, 2], {}), ([1, 2], GSDE)])
+@pytest.mark.parametrize("every", [20, 40])
+@pytest.mark.parametrize(
+    ("crashes", "overrides"), [([0, 3], {}), ([1, 3, 1, 2], {}), ([1, 2, 3, 4], GSDE)]
+)
 def test_interrupted_runs_end_with_the_same_results(
-    crashes: list[int], overrides: dict[str, Any], item: WorkItem, tmp_path: Path
+    crashes: list[int], overrides: dict[str, Any], every: int, item: WorkItem, tmp_path: Path
 ) -> None:
     """A crash after so many reports of a session; half a line is left behind."""
     hyperparameters = merge(item.hyperparameters, overrides)
     measures = () if overrides else item.measures
-    item = replace(item, hyperparameters=hyperparameters, measures=measures)
+    item = replace(item, hyperparameters=hyperparameters, measures=measures, checkpoint_every=every)
     straight, folder = tmp_path / "straight", tmp_path / "interrupted"
     straight.mkdir()
     folder.mkdir()
@@ -101,6 +110,30 @@ def test_interrupted_runs_end_with_the_same_results(
     done = files.read_done()
     assert done is not None
     assert done["steps"] == 120
+
+
+def test_a_run_that_was_told_to_stop_finishes_its_stage_later(
+    item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SIGTERM writes a checkpoint between two measurements."""
+    straight, folder = tmp_path / "straight", tmp_path / "stopped"
+    straight.mkdir()
+    folder.mkdir()
+    run_item(item, straight, quiet)
+    step = SeedExperience.step
+
+    def stop_at_50(self: SeedExperience, runtime: EngineRuntime) -> tuple:
+        if self.models[0].num_timesteps == 50:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self, runtime)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SeedExperience, "step", stop_at_50)
+        with pytest.raises(SystemExit):
+            run_item(item, folder, quiet)
+    assert list(ItemFiles(folder, item.key).checkpoints.glob("*/*-step-51"))
+    run_item(item, folder, quiet)
+    assert contents(folder) == contents(straight)
 
 
 def _interrupt(item: WorkItem, folder: Path) -> ItemFiles:
@@ -140,49 +173,83 @@ def test_a_number_changed_behind_a_checkpoint_is_noticed(item: WorkItem, tmp_pat
 
 
 @pytest.mark.parametrize("overrides", [{}, GSDE], ids=["batch", "separate"])
-def test_half_a_checkpoint_is_named(
+def test_damaged_checkpoints_are_named(
     overrides: dict[str, Any], item: WorkItem, tmp_path: Path
 ) -> None:
     hyperparameters = merge(item.hyperparameters, overrides)
     item = replace(item, hyperparameters=hyperparameters, measures=(), pictures_at=())
     files = _interrupt(item, tmp_path)
+    table = files.table.read_bytes()
     for path in (path for path in files.checkpoints.rglob("*") if path.suffix != ".json"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(ValueError, match=r"step_0+\d+ must hold a whole checkpoint, got"):
+    with pytest.raises(ValueError, match=r"only damaged ones .*: delete .* to repeat this item"):
         run_item(item, tmp_path, quiet)
+    assert files.table.read_bytes() == table
 
 
-def test_a_state_without_its_fields_is_named(item: WorkItem, tmp_path: Path) -> None:
-    files = _interrupt(item, tmp_path)
-    next(files.checkpoints.glob("step_*/state.json")).write_text("{}")
-    with pytest.raises(ValueError, match=r"state\.json must hold 'step' \(int\), got {}"):
-        run_item(item, tmp_path, quiet)
-    next(files.checkpoints.glob("step_*/state.json")).unlink()
-    with pytest.raises(ValueError, match=r"step_0+\d+ must hold state\.json: delete .* to repeat"):
-        run_item(item, tmp_path, quiet)
+def test_one_damaged_checkpoint_costs_only_time(item: WorkItem, tmp_path: Path) -> None:
+    """Rows are cut to the older checkpoint, too."""
+    straight, folder = tmp_path / "straight", tmp_path / "damaged"
+    straight.mkdir()
+    folder.mkdir()
+    run_item(item, straight, quiet)
+    files = _interrupt(item, folder)
+    newest = max(files.checkpoints.glob("*/*-step-*"))
+    (newest / "state.pt").write_bytes(b"")
+    with pytest.warns(RuntimeWarning, match="newer checkpoints are damaged"):
+        run_item(item, folder, quiet)
+    assert contents(folder) == contents(straight)
 
 
+@pytest.mark.parametrize("overrides", [{}, GSDE], ids=["batch", "separate"])
 def test_a_crash_while_saving_leaves_the_last_checkpoint(
-    item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    overrides: dict[str, Any], item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    hyperparameters = merge(item.hyperparameters, overrides)
+    item = replace(item, hyperparameters=hyperparameters, measures=(), pictures_at=())
+    straight, folder = tmp_path / "straight", tmp_path / "broken"
+    straight.mkdir()
+    folder.mkdir()
+    run_item(item, straight, quiet)
     writes = []
-    write = training.write_json
+    collect = state.collect
 
-    def fail_at_third(path: Path, content: dict) -> None:
-        writes.append(path)
+    def fail_at_third(run: Run) -> dict[str, bytes]:
+        writes.append(run)
         if len(writes) == 3:
             raise Crash
-        write(path, content)
+        return collect(run)
 
     with monkeypatch.context() as patch:
-        patch.setattr(training, "write_json", fail_at_third)
+        patch.setattr(state, "collect", fail_at_third)
         with pytest.raises(Crash):
-            run_item(item, tmp_path, quiet)
-    first: list[int] = []
-    run_item(item, tmp_path, lambda key, step: first.append(step))
-    assert first[0] == 40
-    assert len(ItemFiles(tmp_path, item.key).read_rows()) == 12
+            run_item(item, folder, quiet)
+    steps: list[int] = []
+    run_item(item, folder, lambda key, step: steps.append(step))
+    assert steps[0] == 0
+    assert contents(folder) == contents(straight)
+
+
+class Locked(gym.Wrapper):
+    """An environment that cannot be pickled, as simulators outside of Python cannot."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.generator = (value for value in range(3))
+
+
+def test_environments_that_cannot_be_pickled_begin_new_episodes(
+    item: WorkItem, tmp_path: Path
+) -> None:
+    gym.register("Locked-v0", entry_point=lambda: Locked(gym.make("TunnelCircle-v0")))
+    item = replace(item, env_id="Locked-v0", measures=(), pictures_at=())
+    with pytest.warns(RuntimeWarning, match="cannot be saved"):
+        files = _interrupt(item, tmp_path)
+    with pytest.warns(RuntimeWarning, match="resuming begins new episodes") as caught:
+        run_item(item, tmp_path, quiet)
+    assert sum("resuming begins" in str(one.message) for one in caught) == 1
+    assert [row["step"] for row in files.read_rows() if row["seed"] == 2] == [*range(20, 121, 20)]
 
 
 def test_a_finished_item_is_not_repeated(item: WorkItem, tmp_path: Path) -> None:

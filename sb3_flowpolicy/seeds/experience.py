@@ -1,0 +1,166 @@
+"""Experience of S agents: collected side by side, stored, and sampled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.engine import EngineRuntime
+from sb3_flowpolicy.engine.update import Batch
+from sb3_flowpolicy.guard.finite import check_experience
+from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.seeds.setup import EnvFactory, make_vec_env
+from sb3_flowpolicy.seeds.storage import SeedNoise, SeedStorage
+
+
+class SeedExperience:
+    """Environments, replay buffers and random numbers of S agents.
+
+    Args:
+        models: The agents.
+        seeds: Their seeds.
+        env: Registered id, or a function that makes an environment.
+    """
+
+    def __init__(self, models: Sequence[SACFlow], seeds: Sequence[int], env: str | EnvFactory):
+        self.models, self.seeds = models, seeds
+        self.venv = make_vec_env(env, len(seeds))
+        self.obs: np.ndarray | None = None
+        self.storage = SeedStorage(self._buffers())
+        self._exploration = ColoredExploration()
+        self._noise: dict[str, SeedNoise] = {}
+        self._fit_noise()
+
+    def _buffers(self) -> list[Any]:
+        return [model.replay_buffer for model in self.models]
+
+    def fit(self) -> None:
+        """Adapt to changes of the agents since the last run."""
+        # An agent that was trained on its own has its own buffer since then.
+        if not self.storage.rows.holds(self._buffers()):
+            self.storage = SeedStorage(self._buffers())
+        self.storage.synchronize()
+        self._fit_noise()
+
+    def _fit_noise(self) -> None:
+        """Keep the random numbers that fit the agents' settings, and begin the others anew."""
+        first, before = self.models[0], self._noise
+        assert isinstance(first.actor, FlowActor)
+        noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
+        self._exploration.fit(first, len(self.seeds), self.venv)
+        process = self._exploration.process
+        # Name -> shape, and whether it is uniform.
+        wanted = {
+            "random actions": (shape, True),
+            "actions": ((1, noise_dim) if process is None else process.white_shape[1:], False),
+            "updates": ((2, first.batch_size, noise_dim), False),
+            "rows": ((first.batch_size,), True),
+        }
+        self._noise = {
+            name: before[name]
+            if name in before and before[name].shape == needed
+            else SeedNoise(self.seeds, needed, stream, uniform)
+            for stream, (name, (needed, uniform)) in enumerate(wanted.items())
+        }
+
+    def reset(self) -> None:
+        """Begin new episodes; a batch that trains on does not repeat those it has seen."""
+        step = self.models[0].num_timesteps
+        seeds = [seed + step for seed in self.seeds]
+        # Typed as one seed, documented as one per environment.
+        self.obs, _ = self.venv.reset(seed=seeds)  # type: ignore[arg-type]
+        check_experience({"observations": self.obs}, step, self.name)
+        self._exploration.restart()
+
+    def step(self, runtime: EngineRuntime) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step all environments once and store the transitions.
+
+        Returns:
+            Rewards (S,), which episodes ended (S,), and the infos of the vectorized environment.
+        """
+        assert self.obs is not None
+        first = self.models[0]
+        scaled = self._act(runtime, self.obs)
+        obs, rewards, terminated, truncated, infos = self.venv.step(
+            first.policy.unscale_action(scaled)
+        )
+        step, dones, next_obs = first.num_timesteps + 1, terminated | truncated, obs
+        if dones.any():
+            # The environment has been reset already: the last observation is in the info.
+            next_obs = obs.copy()
+            for index in np.flatnonzero(dones).tolist():
+                next_obs[index] = infos["final_obs"][index]
+            check_experience({"final observations": next_obs}, step, self.name)
+        check_experience({"observations": obs, "rewards": rewards}, step, self.name)
+        self.storage.add(
+            observations=self.obs,
+            next_observations=next_obs,
+            actions=scaled.reshape(len(scaled), -1),
+            rewards=rewards,
+            dones=dones,
+            timeouts=truncated & ~terminated,
+        )
+        self.obs = obs
+        self._exploration.restart(dones)
+        return rewards, dones, infos
+
+    def _act(self, runtime: EngineRuntime, obs: np.ndarray) -> np.ndarray:
+        """Return scaled actions, (S, *shape)."""
+        first = self.models[0]
+        random_steps = first.learning_starts if first.random_steps is None else first.random_steps
+        if first.num_timesteps < random_steps:
+            return (self._noise["random actions"].draw() * 2 - 1).float().numpy()
+        noise = self._noise["actions"].draw()
+        if self._exploration.process is not None:
+            noise = self._exploration.process.step(noise).unsqueeze(1)
+        engine = runtime.engine()
+        assert engine is not None
+        actions = engine.act(th.from_numpy(obs).unsqueeze(1), noise)
+        return actions.squeeze(1).numpy().reshape(len(obs), *(first.action_space.shape or ()))
+
+    def minibatches(self, count: int) -> list[Batch]:
+        """Draw minibatches of all agents for as many updates."""
+        rows = self._noise["rows"].draw_many(count)
+        noise = self._noise["updates"].draw_many(count).transpose(1, 2)
+        return self.storage.gather(rows, self.models[0].gamma, noise)
+
+    def name(self, index: int) -> str:
+        """Name an agent in an error message."""
+        return f"seed {self.seeds[index]}"
+
+    def state(self) -> dict[str, Any]:
+        """Return everything needed to continue, except environments and replay buffers."""
+        return {
+            "noise": {name: one.state() for name, one in self._noise.items()},
+            "obs": self.obs,
+            "exploration": self._exploration.state(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state` returned, except the observation."""
+        for name, one in self._noise.items():
+            one.set_state(state["noise"][name])
+        self._exploration.load_state(state["exploration"])
+
+
+def info_of(infos: dict[str, Any], index: int, done: bool) -> dict[str, Any]:
+    """Return one environment's info of a step, from those of a vectorized environment.
+
+    Example:
+        >>> infos = {"x": np.array([1.0, 2.0]), "_x": np.array([True, False])}
+        >>> info_of(infos, 0, False), info_of(infos, 1, False)
+        ({'x': 1.0}, {})
+    """
+    own = infos.get("final_info", {}) if done else infos
+    return {
+        name: values[index].item() if values.ndim == 1 and values.dtype != object else values[index]
+        for name, values in own.items()
+        if isinstance(values, np.ndarray)
+        and not name.startswith(("_", "final_"))
+        and own.get(f"_{name}", np.ones(len(values), bool))[index]
+    }
