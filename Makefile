@@ -8,7 +8,7 @@ SEED ?= 1
 LOGS ?= logs
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint types check clean
+.PHONY: help train test docs lint types check clean
 
 help:  ## Show this help
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
@@ -28,6 +28,13 @@ train: $(VENV)/.installed  ## Train ALGO on ENV with SEED, print the success rat
 test: $(VENV)/.installed  ## Run the tests
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
+$(VENV)/.docs-installed: $(VENV)/.installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
+docs: $(VENV)/.docs-installed  ## Build the documentation in docs/_build/html
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs docs/_build/html
+
 lint: $(VENV)/.installed  ## Check style
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -38,4 +45,4 @@ types: $(VENV)/.installed  ## Check types
 check: lint types test  ## Everything that has to pass before a commit lands
 
 clean:  ## Remove the virtual environment and caches
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) docs/_build .mypy_cache .pytest_cache .ruff_cache
