@@ -9,7 +9,7 @@ SEED ?= 1
 LOGS ?= logs
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lowest sb3-tests lint types check clean
+.PHONY: help train test docs lowest sb3-tests lint types check clean
 
 help:  ## Show this help
 	@grep -E '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-9s %s\n", $$1, $$2}'
@@ -42,6 +42,13 @@ lowest: $(LOWEST)/.installed  ## Run the smoke tests with the lowest versions al
 sb3-tests: $(VENV)/.installed  ## Run the SAC tests of the stable-baselines3 checkout SB3 with SACFlow
 	$(BIN)/python tests/sb3_own_tests.py $(SB3)
 
+$(VENV)/.docs-installed: $(VENV)/.installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
+docs: $(VENV)/.docs-installed  ## Build the documentation in docs/_build/html
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs docs/_build/html
+
 lint: $(VENV)/.installed  ## Check style
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -52,4 +59,4 @@ types: $(VENV)/.installed  ## Check types
 check: lint types test  ## Everything that has to pass before a commit lands
 
 clean:  ## Remove the virtual environments and caches
-	rm -rf $(VENV) $(LOWEST) .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(LOWEST) docs/_build .mypy_cache .pytest_cache .ruff_cache

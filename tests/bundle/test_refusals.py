@@ -115,7 +115,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     ),
     "shape of the entropy coefficient": (
         array("log_ent_coef", lambda log: log.reshape(())),
-        "log_ent_coef must have the type and the values",
+        r"log_ent_coef must be torch.float32 of shape \(1,\), got torch.float32 \(\)",
     ),
     "statistics": (setting("normalization.epsilon", 0), "epsilon must be above 0"),
     "variance": (array("normalization.0.var", lambda var: -var), "var must be at least 0"),

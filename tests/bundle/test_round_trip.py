@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import BundleError, SACFlow
+from sb3_flowpolicy.algorithms.off_policy import OffPolicyFlow
 from sb3_flowpolicy.distributions import registered_distributions
 from tests.bundle.conftest import FAST, NET, UNUSUAL, behind_statistics, make_model, multi_env
 
@@ -227,9 +228,13 @@ def test_every_argument_of_the_constructor_is_held_or_left_out_on_purpose() -> N
     """A new argument has to be thought of here, and in SACFlow.settings."""
     import inspect
 
-    own = [*inspect.signature(SACFlow.__init__).parameters]
+    own = [
+        name
+        for kind in (SACFlow, OffPolicyFlow)
+        for name in inspect.signature(kind.__init__).parameters
+    ]
     theirs = [*inspect.signature(SAC).parameters]
-    known = {*theirs, *own} - {"self", "policy", "env", "sac_args", "sac_kwargs"}
+    known = {*theirs, *own} - {"self", "policy", "env", "args", "kwargs", "sac_args", "sac_kwargs"}
     elsewhere = {"learning_rate", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
     refused = {"action_noise"}
     left_out = {"demonstrations", "tensorboard_log", "verbose", "device", "_init_setup_model"}

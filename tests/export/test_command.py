@@ -130,4 +130,4 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     out = capsys.readouterr().out
     assert "python -m sb3_flowpolicy.export onnx" in out
-    assert "loading one runs whatever code is in it" in out
+    assert "loading a pickle runs the code in it" in " ".join(out.split())
