@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-import numbers
 from functools import lru_cache
 
 import numpy as np
 import torch as th
+
+from sb3_flowpolicy.common.validation import is_number
 
 MAX_COLOR = 1.5
 """Largest exponent of the spectrum."""
@@ -118,11 +119,11 @@ class NoiseProcess:
 
 def check_color(color: float, correlation_time: float | None, prefix: str = "") -> None:
     """Raise ``ValueError`` unless these describe a process; names get a prefix in messages."""
-    if not _is_number(color) or not 0 <= color <= MAX_COLOR:
+    if not is_number(color) or not 0 <= color <= MAX_COLOR:
         raise ValueError(f"{prefix}color must be between 0 (white) and {MAX_COLOR}, got {color!r}")
     if correlation_time is None:
         return
-    if not _is_number(correlation_time) or not 0 < correlation_time < math.inf:
+    if not is_number(correlation_time) or not 0 < correlation_time < math.inf:
         raise ValueError(
             f"{prefix}correlation_time must be above 0 steps, got {correlation_time!r}"
         )
@@ -131,10 +132,6 @@ def check_color(color: float, correlation_time: float | None, prefix: str = "") 
             f"{prefix}color must be 0 where {prefix}correlation_time is given, "
             f"got {color} and {correlation_time}"
         )
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 @lru_cache(maxsize=8)

@@ -9,8 +9,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_flowpolicy.checkpoint.environments import check_same_build
-from sb3_flowpolicy.checkpoint.session import RunCheckpoints, check_every, open_checkpoint
+from sb3_flowpolicy.checkpoint.session import RunCheckpoints, open_checkpoint
 from sb3_flowpolicy.checkpoint.store import has_checkpoint
+from sb3_flowpolicy.common.validation import integer
 
 
 class RunCheckpointCallback(BaseCallback):
@@ -33,7 +34,7 @@ class RunCheckpointCallback(BaseCallback):
         self, checkpoint_every: int, checkpoint_path: str | Path, resume: bool = False
     ) -> None:
         super().__init__()
-        self.checkpoint_every = check_every(checkpoint_every)
+        self.checkpoint_every = integer(1)("checkpoint_every", checkpoint_every)
         self.checkpoint_path = checkpoint_path
         self.resume = resume
 

@@ -18,6 +18,7 @@ from sb3_flowpolicy.checkpoint.segments import RowFiles
 from sb3_flowpolicy.checkpoint.signals import StopSignals
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.checkpoint.store import Checkpoint, CheckpointStore
+from sb3_flowpolicy.common.validation import integer
 
 _STATE = "state.pt"
 
@@ -101,7 +102,7 @@ class RunCheckpoints:
         Raises:
             ValueError: As :meth:`learning`.
         """
-        check_every(every)
+        integer(1)("checkpoint_every", every)
         path = Path(path)
         if self.path is None or self.path.resolve() != path.resolve():
             if self.active:
@@ -261,14 +262,6 @@ def load_agent(
         return algorithm.load(path, env=env, device=device, force_reset=False)
     except ValueError as error:
         raise ValueError(f"env must be that of {checkpoint.folder}: {error}") from error
-
-
-def check_every(checkpoint_every: int) -> int:
-    """Return ``checkpoint_every``, or raise ``ValueError`` if it is below 1."""
-    whole = isinstance(checkpoint_every, int) and not isinstance(checkpoint_every, bool)
-    if not whole or checkpoint_every < 1:
-        raise ValueError(f"checkpoint_every must be at least 1, got {checkpoint_every!r}")
-    return checkpoint_every
 
 
 def _facts(run: Run) -> dict[str, Any]:
