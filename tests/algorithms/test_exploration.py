@@ -240,18 +240,18 @@ def test_settings_of_a_batch_can_change() -> None:
     settings = {name: value for name, value in FAST.items() if name != "seed"}
     batch = SeedBatch("GaussPolicy", "TunnelDiagonal-v0", 2, **settings)
     batch.learn(12)
-    assert batch._exploration.process is None
-    updates = batch._noise["updates"]
+    assert batch._experience._exploration.process is None
+    updates = batch._experience._noise["updates"]
     for model in batch.models:
         model.action_noise_color = 1.0
     batch.learn(4, reset_num_timesteps=False)
-    assert batch._exploration.process is not None
-    assert batch._noise["actions"].shape == batch._exploration.process.white_shape[1:]
-    assert batch._noise["updates"] is updates  # whose numbers go on
+    assert batch._experience._exploration.process is not None
+    assert batch._experience._noise["actions"].shape == batch._experience._exploration.process.white_shape[1:]
+    assert batch._experience._noise["updates"] is updates  # whose numbers go on
     for model in batch.models:
         model.action_noise_color = 0.0
     batch.learn(4, reset_num_timesteps=False)
-    assert batch._exploration.process is None
+    assert batch._experience._exploration.process is None
 
 
 def test_processes_need_not_send_their_spec() -> None:
