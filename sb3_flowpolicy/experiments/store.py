@@ -271,18 +271,18 @@ class ItemFiles:
         Raises:
             ValueError: If a line is corrupt or, once the item is finished, if a file was changed.
         """
-        if done is not None:
-            if done["seeds"] != list(item["seeds"]) or done["steps"] < item["steps"]:
-                raise ValueError(
-                    f"{self.done} must be of {item['steps']} steps of seeds {list(item['seeds'])}, "
-                    f"got {done['steps']} of {done['seeds']}"
-                )
-            damage = self.damage(done)
-            if damage:
-                raise ValueError(f"{damage}: {_ADVICE}")
+        seeds, steps = list(item["seeds"]), item["steps"]
+        if done is not None and (done["seeds"] != seeds or done["steps"] < steps):
+            raise ValueError(
+                f"{self.done} must be of {steps} steps of seeds {seeds}, "
+                f"got {done['steps']} of {done['seeds']}"
+            )
         logs: dict[int, list[Row]] = {}
-        for row in self.read_rows():
+        for row in self.read_rows():  # first, as its errors name the line
             logs.setdefault(int(row["seed"] or 0), []).append(row)
+        damage = None if done is None else self.damage(done)
+        if damage:
+            raise ValueError(f"{damage}: {_ADVICE}")
         return logs
 
 

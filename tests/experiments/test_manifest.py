@@ -44,7 +44,7 @@ def test_entries_are_complete(experiment: Experiment) -> None:
     if what_is_missing(experiment) is None:
         plan = make_plan(experiment)
         assert len(plan.items) == len(experiment.settings) * len(experiment.agents)
-        assert plan.settings()["seeds"] == list(range(1, 11))
+        assert plan.settings()["seeds"] == list(range(1, experiment.seeds + 1))
 
 
 def test_hyperparameters_are_those_of_the_zoo() -> None:
