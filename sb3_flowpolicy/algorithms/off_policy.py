@@ -167,7 +167,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
             total_timesteps: As in SB3, as are the following.
             callback: Called at every step.
             log_interval: Episodes between two dumps of the log.
-            tb_log_name: Name of the TensorBoard run; default: the algorithm's.
+            tb_log_name: Name of the TensorBoard run. Default: the stock algorithm's, as in SB3.
             reset_num_timesteps: Whether to count from zero.
             progress_bar: Whether to show one.
             checkpoint_every: Environment steps between two checkpoints for :meth:`resume`. Ctrl-C
@@ -187,7 +187,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
                 total_timesteps,
                 callback,
                 log_interval,
-                tb_log_name or type(self).__name__,
+                tb_log_name or self.stock.__name__,
                 reset_num_timesteps,
                 progress_bar,
             )

@@ -246,7 +246,10 @@ def test_settings_of_a_batch_can_change() -> None:
         model.action_noise_color = 1.0
     batch.learn(4, reset_num_timesteps=False)
     assert batch._experience._exploration.process is not None
-    assert batch._experience._noise["actions"].shape == batch._experience._exploration.process.white_shape[1:]
+    assert (
+        batch._experience._noise["actions"].shape
+        == batch._experience._exploration.process.white_shape[1:]
+    )
     assert batch._experience._noise["updates"] is updates  # whose numbers go on
     for model in batch.models:
         model.action_noise_color = 0.0

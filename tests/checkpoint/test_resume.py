@@ -245,8 +245,8 @@ def test_tensorboard_shows_one_run(tmp_path: Path) -> None:
     SACFlow.resume(path, ENV).learn(110, log_interval=2, **checkpoints)
     curves = []
     for name in ("calm", "broken"):
-        assert [folder.name for folder in (tmp_path / name).iterdir()] == ["SACFlow_1"]
-        events = EventAccumulator(str(tmp_path / name / "SACFlow_1")).Reload()
+        assert [folder.name for folder in (tmp_path / name).iterdir()] == ["SAC_1"]
+        events = EventAccumulator(str(tmp_path / name / "SAC_1")).Reload()
         curves.append([(one.step, one.value) for one in events.Scalars("rollout/ep_rew_mean")])
     assert curves[0] == curves[1]
     assert len(curves[0]) > 3

@@ -195,9 +195,7 @@ def test_folders_of_others_do_not_count(run: Path) -> None:
 @pytest.mark.parametrize("every", [0, 2.5, "10", True])
 def test_an_interval_is_a_positive_whole_number(every: Any, tmp_path: Path) -> None:
     model = SACFlow("FlowPolicy", ENV, **FAST)
-    with pytest.raises(
-        ValueError, match=f"an integer of at least 1, got {every!r}"
-    ):
+    with pytest.raises(ValueError, match=f"an integer of at least 1, got {every!r}"):
         model.learn(10, checkpoint_every=every, checkpoint_path=tmp_path)
 
 
