@@ -240,8 +240,9 @@ def test_settings_of_a_batch_can_change() -> None:
     settings = {name: value for name, value in FAST.items() if name != "seed"}
     batch = SeedBatch("GaussPolicy", "TunnelDiagonal-v0", 2, **settings)
     batch.learn(12)
-    assert batch._experience._exploration.process is None
-    updates = batch._experience._noise["updates"]
+    exploration, noise = batch._experience._exploration, batch._experience._noise
+    assert exploration.process is None
+    updates = noise["updates"]
     for model in batch.models:
         model.action_noise_color = 1.0
     batch.learn(4, reset_num_timesteps=False)
@@ -254,7 +255,7 @@ def test_settings_of_a_batch_can_change() -> None:
     for model in batch.models:
         model.action_noise_color = 0.0
     batch.learn(4, reset_num_timesteps=False)
-    assert batch._experience._exploration.process is None
+    assert exploration.process is None
 
 
 def test_processes_need_not_send_their_spec() -> None:
