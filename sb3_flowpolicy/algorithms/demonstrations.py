@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import math
+import pkgutil
 import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,16 +24,10 @@ KEYS = ("observations", "actions", "rewards", "next_observations", "terminations
 def record_demonstrations(
     env: gym.Env, controller: Callable[[Any], np.ndarray], n_steps: int, seed: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Record the transitions of a controller.
-
-    Args:
-        env: Environment with array observations.
-        controller: Function from an observation to an action of the environment.
-        n_steps: Number of transitions N, at least 1.
-        seed: Seed of the first reset.
+    """Record transitions of a controller, a function from an observation to an action.
 
     Returns:
-        Arrays with N rows under the keys ``observations``, ``actions``, ``rewards``,
+        Arrays with ``n_steps`` rows under the keys ``observations``, ``actions``, ``rewards``,
         ``next_observations``, ``terminations`` and ``truncations``, as arguments of
         :meth:`SACFlow.add_demonstrations` or ``np.savez``.
 
@@ -45,8 +38,6 @@ def record_demonstrations(
         >>> demos["observations"].shape
         (5, 3)
     """
-    if n_steps < 1:
-        raise ValueError(f"n_steps must be at least 1, got {n_steps}")
     columns: dict[str, list] = {key: [] for key in KEYS}
     obs, _ = env.reset(seed=seed)
     for _ in range(n_steps):
@@ -60,22 +51,27 @@ def record_demonstrations(
 
 
 def is_recipe(source: Any) -> bool:
-    """Return whether this is a recipe for :func:`follow_recipe` and not demonstrations."""
+    """Return whether these are arguments for :func:`follow_recipe` and not demonstrations."""
     return isinstance(source, Mapping) and "controller" in source
 
 
 def follow_recipe(
-    recipe: Mapping[str, Any], env: VecEnv, seed: int | None = None
+    env: VecEnv,
+    seed: int | None,
+    *,
+    controller: str | Callable[[Any], np.ndarray],
+    n_steps: int,
+    controller_kwargs: Mapping[str, Any] | None = None,
 ) -> dict[str, np.ndarray]:
     """Record demonstrations in a fresh environment like the first of ``env``.
 
     Args:
-        recipe: ``controller``: function from an observation to an action, or the import path of a
-            class or function that makes one, such as ``flowpolicy_envs.Holder``, with its
-            arguments under ``controller_kwargs``; ``n_steps``: number of transitions. May come
-            from a YAML file.
         env: Environments that were made from registered ids.
         seed: Seed of the first reset.
+        controller: Function from an observation to an action, or the import path of a class or
+            function that makes one, such as ``flowpolicy_envs.Holder``.
+        n_steps: Number of transitions.
+        controller_kwargs: Arguments of that class or function.
 
     Returns:
         The arrays of :func:`record_demonstrations`.
@@ -83,24 +79,14 @@ def follow_recipe(
     Example:
         >>> import flowpolicy_envs
         >>> from stable_baselines3.common.env_util import make_vec_env
-        >>> recipe = {"controller": "flowpolicy_envs.Holder", "n_steps": 80}
-        >>> demos = follow_recipe(recipe, make_vec_env("SquareMove-v0"), seed=0)
+        >>> env = make_vec_env("SquareMove-v0")
+        >>> demos = follow_recipe(env, seed=0, controller="flowpolicy_envs.Holder", n_steps=80)
         >>> bool(demos["truncations"][-1]), demos["actions"].shape
         (True, (80, 8))
     """
-    known = {"controller", "controller_kwargs", "n_steps"}
-    if set(recipe) - known or "n_steps" not in recipe:
-        raise ValueError(f"demonstrations must have the keys {sorted(known)}, got {sorted(recipe)}")
-    controller = recipe["controller"]
+    act: Any = controller
     if isinstance(controller, str):
-        module, _, name = controller.rpartition(".")
-        try:
-            factory = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(
-                f"controller must be the import path of a class or function, got {controller!r}"
-            ) from error
-        controller = factory(**recipe.get("controller_kwargs", {}))
+        act = pkgutil.resolve_name(controller)(**(controller_kwargs or {}))
     spec = env.get_attr("spec")[0]
     if spec is None:
         raise ValueError("demonstrations can be recorded only in environments made from an id")
@@ -108,7 +94,7 @@ def follow_recipe(
     kwargs = {**spec.kwargs, "render_mode": None}
     fresh = gym.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
     with closing(fresh):
-        return record_demonstrations(fresh, controller, recipe["n_steps"], seed)
+        return record_demonstrations(fresh, act, n_steps, seed)
 
 
 def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -125,9 +111,17 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
             lengths differ.
     """
     if isinstance(source, Mapping):
-        arrays = dict(source)
+        arrays = source
     elif isinstance(source, str | Path) and zipfile.is_zipfile(source):
-        arrays = _read_npz(source)
+        try:
+            with np.load(source, allow_pickle=False) as file:
+                arrays = {key: file[key] for key in KEYS if key in file}
+        # On damaged files numpy, zipfile and zlib raise many types of exceptions.
+        except Exception as error:
+            raise ValueError(
+                f"demonstrations must be an .npz file of arrays of numbers, got {source} "
+                f"({type(error).__name__}: {error})"
+            ) from error
     else:
         raise ValueError(
             f"demonstrations must be arrays or an .npz file that exists, got {source!r}"
@@ -137,10 +131,11 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
         raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")
     arrays = {key: np.asarray(arrays[key]) for key in KEYS}
     for key, array in arrays.items():
-        if array.dtype.kind not in "biuf":
-            raise ValueError(f"demonstrations must be numbers, got {array.dtype} in {key}")
-        if not all_finite(array):
-            raise ValueError(f"demonstrations must be finite, got NaN or infinity in {key}")
+        if array.dtype.kind not in "biuf" or not all_finite(array):
+            raise ValueError(
+                f"demonstrations must be finite, got NaN, infinity or no numbers in {key} "
+                f"({array.dtype})"
+            )
     arrays["rewards"] = arrays["rewards"].reshape(-1)
     for key in ("terminations", "truncations"):
         arrays[key] = arrays[key].reshape(-1).astype(bool)
@@ -150,47 +145,13 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     return arrays
 
 
-def _read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Read the six arrays without unpickling, and without allocating more than the file holds."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in archive.infolist():
-                if entry.filename in {f"{key}.npy" for key in KEYS}:
-                    with archive.open(entry) as member:
-                        _check_size(member, entry.file_size)
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in KEYS if key in file}
-    # On damaged files numpy, zipfile and zlib raise many types of exceptions.
-    except Exception as error:
-        raise ValueError(
-            f"demonstrations must be an .npz file of arrays of numbers, got {path} "
-            f"({type(error).__name__}: {error})"
-        ) from error
-
-
-def _check_size(file: IO[bytes], size: int) -> None:
-    """Raise ``ValueError`` if an array's header does not announce ``size`` bytes in total."""
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    shape, _, dtype = readers[np.lib.format.read_magic(file)](file)
-    if dtype.hasobject or file.tell() + math.prod(shape) * dtype.itemsize != size:
-        raise ValueError(f"{size} bytes for {dtype} of shape {shape}")
-
-
 def fill_replay_buffer(
     buffer: ReplayBuffer, policy: BasePolicy, demonstrations: Mapping[str, np.ndarray]
 ) -> int:
-    """Append demonstrations to a replay buffer as if the agent had experienced them.
+    """Append demonstrations, as of :func:`load_demonstrations`, to a replay buffer.
 
     With several environments each gets a run of consecutive rows, and up to n_envs - 1 rows at
     the end are left out.
-
-    Args:
-        buffer: SB3 replay buffer for array observations.
-        policy: Policy with the spaces of the demonstrations.
-        demonstrations: The six arrays of :func:`load_demonstrations`.
 
     Returns:
         Number of transitions that were added.

@@ -39,7 +39,7 @@ from sb3_flowpolicy.engine.replay import COLUMNS, is_plain
 from sb3_flowpolicy.guard import NonFiniteError, TrainingGuard
 from sb3_flowpolicy.guard.finite import ENVIRONMENT, check_experience, check_step
 from sb3_flowpolicy.policies import FlowActor
-from sb3_flowpolicy.policies.off_policy import check_finite_actions
+from sb3_flowpolicy.policies.base import check_finite
 
 SelfOffPolicyFlow = TypeVar("SelfOffPolicyFlow", bound="OffPolicyFlow")
 
@@ -273,7 +273,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
         self, scaled: np.ndarray, action_noise: ActionNoise | None, n_envs: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return actions for the environment and for the replay buffer."""
-        check_finite_actions(scaled)
+        check_finite(scaled)
         scaled = scaled.reshape(n_envs, *(self.action_space.shape or ()))
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)

@@ -219,7 +219,7 @@ class SACFlow(OffPolicyFlow, SAC):
         if self._demonstrations is not None:
             if is_recipe(self._demonstrations):
                 assert self.env is not None
-                recorded = follow_recipe(self._demonstrations, self.env, self.seed)
+                recorded = follow_recipe(self.env, self.seed, **self._demonstrations)
                 self._demonstrations = recorded
             self.add_demonstrations(self._demonstrations)
             self._demonstrations = None

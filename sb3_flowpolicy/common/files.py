@@ -65,8 +65,6 @@ def read_json(path: Path, fields: Mapping[str, Any] | None = None) -> dict[str, 
     """
     try:
         content = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} must be JSON, got an error in line {error.lineno}") from error
     except (ValueError, RecursionError) as error:  # other encodings, a hundred thousand brackets
         raise ValueError(f"{path} must be JSON, got {error}") from error
     require(str(path), content, fields or {})

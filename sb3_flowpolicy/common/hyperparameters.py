@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from sb3_flowpolicy.common.validation import one_of
+
 # Entries that rl_zoo3 handles itself.
 _FOR_THE_ZOO = ("callback", "env_wrapper", "normalize")
 
@@ -31,10 +33,7 @@ def load_hyperparameters(algo: str, env_id: str) -> dict[str, Any]:
     folder = resources.files("zoo_hyperparams")
     # The files of the other algorithms are only for rl_zoo3.
     known = sorted(f.name[:-4] for f in folder.iterdir() if f.name.startswith("sac_"))
-    if algo not in known:
-        raise ValueError(f"algo must be one of {known}, got {algo!r}")
-    if not isinstance(env_id, str):
-        raise ValueError(f"env_id must be a string, got {env_id!r}")
+    one_of(*known)("algo", algo)
     blocks = yaml.safe_load((folder / f"{algo}.yml").read_text())
     block = blocks.get(env_id, blocks["default"])
     return {key: value for key, value in block.items() if key not in _FOR_THE_ZOO}

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.type_aliases import TrainFreq
 
 #: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
@@ -31,20 +30,27 @@ def integer(least: int, most: int = _ANY) -> Check:
     return check
 
 
+def layer_sizes(name: str, value: Any, least: int = 0) -> tuple[int, ...]:
+    """Accept lists and tuples of ``least`` or more integers, each at least 1."""
+    if not isinstance(value, list | tuple) or len(value) < least:
+        raise ValueError(f"{name} must be a list of layer sizes, at least {least}, got {value!r}")
+    return tuple(integer(1)(name, size) for size in value)
+
+
 def number(least: float = -math.inf, most: float = math.inf, above: bool = False) -> Check:
     """Accept finite numbers from ``least`` (or ``above`` it) to ``most``, not booleans."""
 
     def check(name: str, value: Any) -> float:
         if not is_number(value):
-            raise ValueError(f"{name} must be a number, got {value!r}")
-        if not (math.isfinite(value) and least <= value) or (above and value == least):
-            bound = (
-                "finite" if least == -math.inf else f"{'above' if above else 'at least'} {least:g}"
-            )
-            raise ValueError(f"{name} must be {bound}, got {value}")
-        if value > most:
-            raise ValueError(f"{name} must be at most {most:g}, got {value}")
-        return int(value) if isinstance(value, numbers.Integral) else float(value)
+            expected = "a number"
+        elif not (math.isfinite(value) and least <= value) or (above and value == least):
+            expected = f"{'above' if above else 'at least'} {least:g}"
+            expected = "finite" if least == -math.inf else expected
+        elif value > most:
+            expected = f"at most {most:g}"
+        else:
+            return int(value) if isinstance(value, numbers.Integral) else float(value)
+        raise ValueError(f"{name} must be {expected}, got {value!r}")
 
     return check
 
@@ -115,14 +121,10 @@ def entropy_coefficient(name: str, value: Any) -> str | float:
 
 def train_frequency(name: str, value: Any) -> int | tuple[int, str]:
     """Accept a number of steps, or a pair such as ``(1, "episode")``."""
-    if not isinstance(value, tuple):
+    if not isinstance(value, tuple) or len(value) != 2:
         return integer(1)(name, value)
-    unit: Any = value[1] if len(value) == 2 else None
-    if isinstance(value, TrainFreq):
-        unit = value.unit.value
-    if unit not in ("step", "episode"):
-        raise ValueError(f'{name} must be an integer or (integer, "step" | "episode"), got {value}')
-    return integer(1)(name, value[0]), unit
+    unit = getattr(value[1], "value", value[1])  # SB3's TrainFreq holds an enum
+    return integer(1)(name, value[0]), one_of("step", "episode")(name, unit)
 
 
 def mapping(name: str, value: Any) -> Mapping[str, Any]:

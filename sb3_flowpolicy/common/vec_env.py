@@ -20,7 +20,7 @@ def make_batched_env(
     """Make many environments that one compiled call steps, for any SB3 algorithm.
 
     Args:
-        env_id: Id of an environment that brings a vectorised form, as all of ``flowpolicy_envs``.
+        env_id: Id of an environment that brings a vectorized form, as all of ``flowpolicy_envs``.
         n_envs: Number of environments, at least 1.
         seed: Seed of the first; the others get those after it.
         **env_kwargs: Arguments of the environment.
@@ -29,7 +29,7 @@ def make_batched_env(
         The environments, with SB3's record of episodes around them.
 
     Raises:
-        ValueError: If the environment has no vectorised form.
+        gymnasium.error.Error: If the environment has no vectorized form.
 
     Example:
         >>> import flowpolicy_envs
@@ -37,8 +37,6 @@ def make_batched_env(
         >>> env.reset().shape
         (3, 42)
     """
-    if gym.spec(env_id).vector_entry_point is None:
-        raise ValueError(f"env_id must have a vectorised form, got {env_id!r}")
     venv = gym.make_vec(
         env_id,
         num_envs=n_envs,
@@ -55,7 +53,7 @@ class BatchedVecEnv(VecEnv):
     """Translates gymnasium's ``VectorEnv`` to SB3's ``VecEnv``.
 
     Args:
-        venv: Vectorised environment with array observations that resets in the same step.
+        venv: Vectorized environment with array observations that resets in the same step.
 
     Raises:
         ValueError: If it resets at another time.
@@ -115,7 +113,7 @@ class BatchedVecEnv(VecEnv):
         return hasattr(self.venv, attr_name)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return what the batch calls so, for each environment."""
+        """Return the attribute once per environment."""
         return [getattr(self.venv, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -131,7 +129,7 @@ class BatchedVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return whether environments are wrapped: they are not."""
+        """Return False for each environment: none is wrapped on its own."""
         return [False for _ in self._get_indices(indices)]
 
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_flowpolicy.common.validation import integer
 from sb3_flowpolicy.diagnostics.figures import correlation_figure, samples_figure
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.policies.deterministic import critic_values
@@ -89,12 +90,10 @@ class PolicyDiagnosticsCallback(BaseCallback):
         n_samples: int = 64,
     ) -> None:
         super().__init__()
-        self.log_freq, self.image_freq = log_freq, image_freq
-        self.n_states, self.n_samples = n_states, n_samples
-        for name, least in {"log_freq": 1, "image_freq": 0, "n_states": 1, "n_samples": 2}.items():
-            value = getattr(self, name)
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        self.log_freq = integer(1)("log_freq", log_freq)
+        self.image_freq = integer(0)("image_freq", image_freq)
+        self.n_states = integer(1)("n_states", n_states)
+        self.n_samples = integer(2)("n_samples", n_samples)
 
     def _on_training_start(self) -> None:
         actor = getattr(self.model, "actor", None)  # on-policy algorithms have none

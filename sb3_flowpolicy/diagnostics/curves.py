@@ -9,42 +9,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HEADER = "seed,step,test_return,std"
 
-
-def read_evaluations(path: str | Path) -> np.ndarray:
-    """Read an ``evaluations.csv`` as an array (rows, 4) of the columns of ``HEADER``."""
-    header, *rows = Path(path).read_text().splitlines()
-    if header != HEADER or not rows:
-        raise ValueError(f"evaluations must start with {HEADER!r} and have rows, got {path}")
-    return np.array([[float(value) for value in row.split(",")] for row in rows])
-
-
-def curves_figure(evaluations: Mapping[str, np.ndarray]) -> Figure:
+def curves_figure(files: Mapping[str, str | Path]) -> Figure:
     """Draw each seed as a thin line and the mean over seeds as a thick one.
 
     Args:
-        evaluations: Name of the agent -> its array of :func:`read_evaluations`.
+        files: Name of the agent -> its ``evaluations.csv``.
 
-    Example:
-        >>> rows = np.array([[1, 100, 2.0, 0.1], [1, 200, 3.0, 0.1]])
-        >>> len(curves_figure({"sac_flow": rows}).axes[0].lines)
-        2
+    Raises:
+        ValueError: If a file lacks a column.
     """
     figure = new_figure(6.0, 3.6)
     axes = figure.add_subplot()
-    for k, (name, rows) in enumerate(evaluations.items()):
-        steps = np.unique(rows[:, 1])
-        for seed in np.unique(rows[:, 0]):
-            own = rows[rows[:, 0] == seed]
-            axes.plot(own[:, 1], own[:, 2], color=f"C{k}", linewidth=0.8, alpha=0.6)
-        means = [rows[rows[:, 1] == step, 2].mean() for step in steps]
-        axes.plot(steps, means, color=f"C{k}", linewidth=2.2, label=name)
+    for k, (name, file) in enumerate(files.items()):
+        rows = np.genfromtxt(file, delimiter=",", names=True)
+        returns = [rows["test_return"][rows["seed"] == seed] for seed in np.unique(rows["seed"])]
+        draw_seeds(axes, np.unique(rows["step"]), returns, f"C{k}", name)
     axes.set(xlabel="environment steps", ylabel="test return")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
@@ -61,8 +46,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="picture to write")
     args = parser.parse_args(arguments)
     pairs = (entry.rpartition("=") for entry in args.files)
-    evaluations = {name or Path(file).stem: read_evaluations(file) for name, _, file in pairs}
-    curves_figure(evaluations).savefig(args.output, dpi=130)
+    files = {name or Path(file).stem: file for name, _, file in pairs}
+    curves_figure(files).savefig(args.output, dpi=130)
     print(f"Curves: {args.output}")
 
 

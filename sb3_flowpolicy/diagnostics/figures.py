@@ -16,38 +16,20 @@ POLICY_BLUE = "#1f6fb4"
 
 def new_figure(width: float, height: float) -> Figure:
     """Return a figure without a window and without pyplot's global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            'pictures need matplotlib: pip install "sb3_flowpolicy[zoo]"'
-        ) from error
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def draw_seeds(axes: Axes, steps: ArrayLike, values: ArrayLike, color: str, label: str) -> None:
-    """Draw each seed as a thin line and the mean over seeds as a thick one.
-
-    Args:
-        axes: Where to draw.
-        steps: Shape (T,).
-        values: Shape (S, T).
-        color: Color of all lines.
-        label: Name of the mean in the legend.
-    """
+    """Draw each seed of ``values`` (S, T) as a thin line and their mean as a thick one."""
     values = np.asarray(values)
     axes.plot(steps, values.T, color=color, linewidth=0.8, alpha=0.4)
     axes.plot(steps, values.mean(0), color=color, linewidth=2.2, label=label)
 
 
 def correlation_figure(correlation: np.ndarray) -> Figure:
-    """Draw the absolute correlation of all pairs of actions (thesis Fig. 3.17).
-
-    Args:
-        correlation: Matrix of shape (D, D), entries in [-1, 1].
-
-    Returns:
-        A matplotlib figure.
+    """Draw the absolute correlation (D, D) of all pairs of actions (thesis Fig. 3.17).
 
     Example:
         >>> import numpy as np
@@ -71,19 +53,7 @@ def correlation_figure(correlation: np.ndarray) -> Figure:
 
 
 def samples_figure(samples: np.ndarray) -> Figure:
-    """Scatter samples of two-dimensional actions, one panel per state.
-
-    Args:
-        samples: Squashed actions, shape (states, samples, 2).
-
-    Returns:
-        A matplotlib figure.
-
-    Raises:
-        ValueError: If the actions are not two-dimensional.
-    """
-    if samples.ndim != 3 or samples.shape[-1] != 2:
-        raise ValueError(f"samples must have shape (states, samples, 2), got {samples.shape}")
+    """Scatter squashed actions, shape (states, samples, 2), one panel per state."""
     n_columns = min(2, len(samples))
     n_rows = -(-len(samples) // n_columns)
     figure = new_figure(2.2 * n_columns, 2.2 * n_rows)
@@ -91,7 +61,8 @@ def samples_figure(samples: np.ndarray) -> Figure:
     limits = (-1.1, 1.1)
     for panel, points in enumerate(samples):
         axes = figure.add_subplot(n_rows, n_columns, panel + 1)
-        axes.scatter(points[:, 0], points[:, 1], s=6, alpha=0.5, color=POLICY_BLUE, linewidths=0)
+        x, y = points.T
+        axes.scatter(x, y, s=6, alpha=0.5, color=POLICY_BLUE, linewidths=0)
         axes.set(xlim=limits, ylim=limits, aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
         axes.tick_params(labelsize=7)
         axes.set_title(f"state {panel}", fontsize=8)

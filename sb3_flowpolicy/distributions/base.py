@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import numbers
 from abc import ABC, abstractmethod
-from typing import TypeGuard
 
 import torch as th
 from torch import nn
+
+from sb3_flowpolicy.common.validation import integer
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 # Log-densities and gradients fit into float32 up to this many standard deviations from the mean.
@@ -42,8 +42,8 @@ class ActionDistribution(nn.Module, ABC):
 
     def __init__(self, action_dim: int, context_dim: int) -> None:
         super().__init__()
-        self.action_dim = positive_int("action_dim", action_dim)
-        self.context_dim = positive_int("context_dim", context_dim)
+        self.action_dim = integer(1)("action_dim", action_dim)
+        self.context_dim = integer(1)("context_dim", context_dim)
         self.noise_dim = self.action_dim
 
     def rsample_and_log_prob(
@@ -63,28 +63,13 @@ class ActionDistribution(nn.Module, ABC):
         return self._rsample_and_log_prob(context, noise)
 
     def log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
-        """Score arbitrary points.
-
-        Args:
-            context: Features h, shape (..., H).
-            value: Points u, shape (..., D).
-
-        Returns:
-            log p(u | h) in nats, shape (...).
-        """
+        """Return log p(u | h) in nats, shape (...), of points ``value``, shape (..., D)."""
         _check_last_dim("context", context, self.context_dim)
         _check_last_dim("value", value, self.action_dim)
         return self._log_prob(context, value)
 
     def mode(self, context: th.Tensor) -> th.Tensor:
-        """Return the deterministic action: the mean, or for a flow the image of the base mean.
-
-        Args:
-            context: Features h, shape (..., H).
-
-        Returns:
-            The unsquashed action, shape (..., D).
-        """
+        """Return the mean, or for a flow the image of the base mean, shape (..., D)."""
         _check_last_dim("context", context, self.context_dim)
         return self._mode(context)
 
@@ -116,24 +101,8 @@ def score_standard_normal(point: th.Tensor) -> th.Tensor:
 
 
 def soft_bound(value: th.Tensor, bound: float | th.Tensor) -> th.Tensor:
-    r"""Squeeze into (-bound, bound) by :math:`x / (1 + |x| / b)`.
-
-    The slope is 1 at zero and, unlike that of a clip, never vanishes: values near the bound still
-    receive a gradient.
-    """
+    """Squeeze into (-bound, bound): slope 1 at zero and, unlike a clip, a gradient everywhere."""
     return value / (1 + value.abs() / bound)
-
-
-def is_whole(value: object) -> TypeGuard[int]:
-    """Whether this is an integer, numpy's included, but not a boolean."""
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
-
-
-def positive_int(name: str, value: int, least: int = 1) -> int:
-    """Return ``value`` if it is an integer of at least ``least``, else raise ``ValueError``."""
-    if not is_whole(value) or value < least:
-        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
-    return int(value)
 
 
 def _check_last_dim(name: str, tensor: th.Tensor, expected: int) -> None:

@@ -11,9 +11,9 @@ from typing import Literal, cast
 import torch as th
 from torch import nn
 
+from sb3_flowpolicy.common.validation import integer, layer_sizes, one_of
 from sb3_flowpolicy.distributions.base import (
     ActionDistribution,
-    positive_int,
     score_standard_normal,
     standard_normal_log_prob,
 )
@@ -23,9 +23,6 @@ class Coupling(nn.Module, ABC):
     r"""Map of one half b of the coordinates, whose parameters a network computes from the other, a.
 
     .. math:: b \mapsto g(b; \mathrm{network}(a, h))
-
-    The caller computes the part of the network's first layer that reads h, for all couplings at
-    once.
 
     Args:
         passive: Number of coordinates that are read, at least 0.
@@ -44,7 +41,10 @@ class Coupling(nn.Module, ABC):
         self.last = nn.Linear(hidden[-1], outputs)
 
     def forward(self, passive: th.Tensor, projected: th.Tensor) -> th.Tensor:
-        """Return the parameters of g, (..., outputs); with zeros g is the identity."""
+        """Return the parameters of g, (..., outputs); with zeros g is the identity.
+
+        ``projected`` is the first layer's share of h, which all couplings compute in one product.
+        """
         if self.first is not None:
             projected = projected + self.first(passive)
         return self.last(self.between(projected))
@@ -61,11 +61,8 @@ class Coupling(nn.Module, ABC):
 class CouplingPair(nn.Module):
     """Two couplings that split the coordinates in the same way and swap roles.
 
-    Args:
-        features: Number of coordinates D, at least 1.
-        index: Position in the flow, from 0; decides the split (see :func:`split_order`).
-        make: Builds a coupling, given the numbers of coordinates that it reads and moves.
-        couplings: 2, or 1 where the flow's length is odd or D = 1.
+    ``make`` builds a coupling, given the numbers of coordinates that it reads and moves. There are
+    two ``couplings``, or one where the flow's length is odd or D = 1.
     """
 
     order: th.Tensor
@@ -85,35 +82,23 @@ class CouplingPair(nn.Module):
         self.couplings = cast("Sequence[Coupling]", modules)  # ModuleList is not generic
 
     def forward(
-        self, value: th.Tensor, projected: Sequence[th.Tensor]
+        self, value: th.Tensor, projected: Sequence[th.Tensor], inverse: bool = False
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Map base to action side: (..., D) -> (..., D) and log|det J|, shape (...)."""
-        halves, ladj = self._split(value), value.new_zeros(())
-        for i, coupling in enumerate(self.couplings):
-            outputs = coupling(halves[i], projected[i])
-            halves[1 - i], ladjs = coupling.move(halves[1 - i], outputs)
-            ladj = ladj + ladjs.sum(-1)
-        return self._merge(halves), ladj
+        """Map base to action side, or back: (..., D) -> (..., D).
 
-    def inverse(
-        self, value: th.Tensor, projected: Sequence[th.Tensor]
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """Invert :meth:`forward`; the log-determinant is that of :meth:`forward`."""
-        halves, ladj = self._split(value), value.new_zeros(())
-        for i, coupling in reversed(list(enumerate(self.couplings))):
-            outputs = coupling(halves[i], projected[i])
-            halves[1 - i], ladjs = coupling.move_back(halves[1 - i], outputs)
-            ladj = ladj + ladjs.sum(-1)
-        return self._merge(halves), ladj
-
-    def _split(self, value: th.Tensor) -> list[th.Tensor]:
+        The second result is log|det J|, shape (...), of the map from base to action side.
+        """
         if not self.in_order:
             value = value.index_select(-1, self.order)
-        return list(value.split(self.sizes, dim=-1))
-
-    def _merge(self, halves: list[th.Tensor]) -> th.Tensor:
+        halves, ladj = list(value.split(self.sizes, dim=-1)), value.new_zeros(())
+        turns = list(enumerate(self.couplings))
+        for i, coupling in reversed(turns) if inverse else turns:
+            outputs = coupling(halves[i], projected[i])
+            move = coupling.move_back if inverse else coupling.move
+            halves[1 - i], ladjs = move(halves[1 - i], outputs)
+            ladj = ladj + ladjs.sum(-1)
         value = th.cat(halves, dim=-1)
-        return value if self.in_order else value.index_select(-1, self.back)
+        return (value if self.in_order else value.index_select(-1, self.back)), ladj
 
 
 def split_order(features: int, index: int) -> tuple[list[int], int]:
@@ -121,10 +106,6 @@ def split_order(features: int, index: int) -> tuple[list[int], int]:
 
     Pair 0 separates even from odd coordinates, pair 1 alternating blocks of two, then of four,
     and so on. After ceil(log2 D) pairs any two coordinates have been in different halves.
-
-    Args:
-        features: Number of coordinates D, at least 1.
-        index: Position of the pair in the flow, from 0.
 
     Returns:
         A permutation of 0 ... D-1, and the size of its first half (0 where D = 1).
@@ -174,12 +155,9 @@ class CouplingFlow(ActionDistribution):
         init: Literal["identity", "default"] = "identity",
     ) -> None:
         super().__init__(action_dim, context_dim)
-        self.layers = positive_int("layers", layers)
-        if isinstance(hidden, str) or not isinstance(hidden, Sequence) or len(hidden) == 0:
-            raise ValueError(f"hidden must be a non-empty sequence of integers, got {hidden!r}")
-        self.hidden = tuple(positive_int("hidden", units) for units in hidden)
-        if init not in ("identity", "default"):
-            raise ValueError(f'init must be "identity" or "default", got {init!r}')
+        self.layers = integer(1)("layers", layers)
+        self.hidden = layer_sizes("hidden", hidden, least=1)
+        one_of("identity", "default")("init", init)
 
         # The context enters all L couplings through one matrix product.
         self.context_proj = nn.Linear(context_dim, layers * self.hidden[0])
@@ -213,32 +191,27 @@ class CouplingFlow(ActionDistribution):
                 nn.init.zeros_(coupling.last.weight)
                 nn.init.zeros_(coupling.last.bias)
 
-    def _project(
-        self, context: th.Tensor, value: th.Tensor
-    ) -> tuple[th.Tensor, list[list[th.Tensor]]]:
-        """Broadcast ``value`` against the context and project the context for each pair."""
+    def _apply(
+        self, context: th.Tensor, value: th.Tensor, log_prob: th.Tensor, inverse: bool
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Map ``value`` through all pairs and subtract their log-determinants from ``log_prob``."""
         shape = th.broadcast_shapes(context.shape[:-1], value.shape[:-1])
+        value = value.expand(*shape, self.action_dim)
         projected = list(self.context_proj(context).chunk(self.layers, dim=-1))
-        shares = [[projected.pop(0) for _ in pair.couplings] for pair in self.pairs]
-        return value.expand(*shape, self.action_dim), shares
+        steps = [(pair, [projected.pop(0) for _ in pair.couplings]) for pair in self.pairs]
+        for pair, share in reversed(steps) if inverse else steps:
+            value, ladj = pair(value, share, inverse)
+            log_prob = log_prob - ladj
+        return value, log_prob
 
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        value, shares = self._project(context, noise)
-        log_prob = standard_normal_log_prob(noise)
-        for pair, share in zip(self.pairs, shares, strict=True):
-            value, ladj = pair(value, share)
-            log_prob = log_prob - ladj
-        return value, log_prob
+        return self._apply(context, noise, standard_normal_log_prob(noise), inverse=False)
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
-        value, shares = self._project(context, value)
-        total = value.new_zeros(())
-        for pair, share in zip(reversed(self.pairs), reversed(shares), strict=True):
-            value, ladj = pair.inverse(value, share)
-            total = total + ladj
-        return score_standard_normal(value) - total
+        noise, minus_ladj = self._apply(context, value, value.new_zeros(()), inverse=True)
+        return score_standard_normal(noise) + minus_ladj
 
     def _mode(self, context: th.Tensor) -> th.Tensor:
         zeros = context.new_zeros(*context.shape[:-1], self.action_dim)

@@ -30,10 +30,6 @@ class FullCovarianceGaussian(DiagGaussian):
     So :math:`\sigma` is the marginal standard deviation as in :class:`DiagGaussian`, T alone
     determines the correlations, and no inverse depends on a ratio of scales.
 
-    Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
-
     References:
         Thesis section 2.2.2, "Covariance Matrix".
 
@@ -60,31 +56,26 @@ class FullCovarianceGaussian(DiagGaussian):
         index.fill_diagonal_(n_entries + 1)
         self.register_buffer("_entry_index", index.flatten(), persistent=False)
 
-    def unit_lower(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return T, shape (..., D, D), and the log-norms of its rows, shape (..., D)."""
-        shape = context.shape[:-1]
-        zero_one = context.new_tensor([0.0, 1.0]).expand(*shape, 2)
-        entries = zero_one
+    def factors(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Return the mean (..., D), T (..., D, D) and the log of the diagonal of L (..., D)."""
+        loc, log_std = self.loc_and_log_std(context)
+        entries = zero_one = context.new_tensor([0.0, 1.0]).expand(*context.shape[:-1], 2)
         if self.off_diagonal is not None:
             bounded = soft_bound(self.off_diagonal(context), OFF_DIAGONAL_BOUND)
             entries = th.cat([bounded, zero_one], dim=-1)
         lower = entries.index_select(-1, self._entry_index)
         lower = lower.unflatten(-1, (self.action_dim, self.action_dim))
-        return lower, 0.5 * lower.square().sum(-1).log()
+        return loc, lower, log_std - 0.5 * lower.square().sum(-1).log()
 
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        loc, log_std = self.loc_and_log_std(context)
-        lower, log_norm = self.unit_lower(context)
-        log_diag = log_std - log_norm
+        loc, lower, log_diag = self.factors(context)
         sample = loc + log_diag.exp() * (lower * noise.unsqueeze(-2)).sum(-1)
         return sample, standard_normal_log_prob(noise) - log_diag.sum(-1)
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
-        loc, log_std = self.loc_and_log_std(context)
-        lower, log_norm = self.unit_lower(context)
-        log_diag = log_std - log_norm
+        loc, lower, log_diag = self.factors(context)
         scaled = ((value - loc) * (-log_diag).exp()).clamp(-FARTHEST, FARTHEST)
         # Values may grow by a factor of 11 per dimension: float64 suffices for 250 dimensions.
         noise = th.linalg.solve_triangular(

@@ -23,10 +23,6 @@ class DiagGaussian(ActionDistribution):
 
     The heads have the names and the bounds of SB3's SAC actor, so that its checkpoints fit.
 
-    Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
-
     References:
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis eq. 2.12.
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch as th
 from torch import nn
 
+from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.distributions.base import (
     FARTHEST,
     score_standard_normal,
@@ -34,16 +33,12 @@ class Lattice(DiagGaussian):
     least :math:`\sigma_a^2`. The computed ones are clamped there, so that the factorization cannot
     fail.
 
-    As in the paper, the covariance contains the W of the mean and, as in its SAC, passes gradients
-    to it; alpha scales the noise of the features; the noise of one feature moves all actions at
-    once. The differences are:
+    As in the paper's SAC, the covariance passes gradients to W. The differences from the paper are:
 
     - Standard deviations come from linear heads, as in the authors' variant without correlation in
-      time. Their main variant is gSDE's, :math:`\sigma_i^2 = \sum_j S_{ji}^2 h_j^2` with learned S,
-      which has no noise where h is zero.
-    - The authors draw noise for every feature and action, and keep the noise matrices for a number
-      of steps. Here D normals are drawn at every step. ``action_noise_color`` correlates them in
-      time, in the space of actions rather than of features.
+      time. Their main variant is gSDE's, :math:`\sigma_i^2 = \sum_j S_{ji}^2 h_j^2` with learned S.
+    - The authors keep noise matrices of the features for a number of steps. Here D normals are
+      drawn at every step; ``action_noise_color`` correlates them in time.
     - Log standard deviations are bounded softly, :math:`\sigma \in (e^{-10}, e^2)`, not clipped.
       Nothing is added to the variance (the authors' ``std_reg``), and the mean is not clipped.
     - Gradients of the standard deviations reach the features with on-policy algorithms, too.
@@ -52,9 +47,6 @@ class Lattice(DiagGaussian):
         action_dim: Number of action dimensions D, at least 1.
         context_dim: Number of context features H, at least 1.
         alpha: Scale of the noise of the features, at least 0; 0 gives a diagonal covariance.
-
-    Raises:
-        ValueError: If ``alpha`` is negative or not finite.
 
     References:
         Latent Exploration for Reinforcement Learning (Chiappa et al., 2023).
@@ -70,10 +62,7 @@ class Lattice(DiagGaussian):
 
     def __init__(self, action_dim: int, context_dim: int, alpha: float = 1.0) -> None:
         super().__init__(action_dim, context_dim)
-        number = isinstance(alpha, int | float) and not isinstance(alpha, bool)
-        if not number or not 0 <= alpha < math.inf:
-            raise ValueError(f"alpha must be a finite number >= 0, got {alpha!r}")
-        self.alpha = float(alpha)
+        self.alpha = number(0)("alpha", alpha)
         self.latent_log_std = nn.Linear(context_dim, context_dim)
 
     def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -81,12 +70,7 @@ class Lattice(DiagGaussian):
         return self.mu(context), _bounded(self.log_std(context))
 
     def scale_tril(self, context: th.Tensor, log_std: th.Tensor) -> th.Tensor:
-        """Return the Cholesky factor of the covariance, shape (..., D, D), in float64.
-
-        Args:
-            context: Features h, shape (..., H).
-            log_std: Log standard deviation of the noise of the actions, shape (..., D).
-        """
+        """Return the Cholesky factor of the covariance, shape (..., D, D), in float64."""
         latent_variance = (2 * _bounded(self.latent_log_std(context)).double()).exp()
         weight = self.alpha * self.mu.weight.double()
         # The products of the rows of W make the whole covariance a single matrix product.

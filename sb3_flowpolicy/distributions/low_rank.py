@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_flowpolicy.distributions.base import FARTHEST, LOG_SQRT_2PI, positive_int, soft_bound
+from sb3_flowpolicy.common.validation import integer
+from sb3_flowpolicy.distributions.base import FARTHEST, LOG_SQRT_2PI, soft_bound
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
 # tanh(3) = 0.995: with this bound a single column of V spans the whole action box.
@@ -32,9 +33,6 @@ class LowRankGaussian(DiagGaussian):
         context_dim: Number of context features H, at least 1.
         rank: Rank K of the factor V, between 1 and D. Default: 2, or 1 where D = 1.
 
-    Raises:
-        ValueError: If ``rank`` is not between 1 and D.
-
     References:
         Thesis eq. 2.13, which clips V; here V is softly bounded.
 
@@ -51,9 +49,8 @@ class LowRankGaussian(DiagGaussian):
 
     def __init__(self, action_dim: int, context_dim: int, rank: int | None = None) -> None:
         super().__init__(action_dim, context_dim)
-        self.rank = min(2, action_dim) if rank is None else positive_int("rank", rank)
-        if self.rank > action_dim:
-            raise ValueError(f"rank must be at most action_dim = {action_dim}, got {rank}")
+        rank = min(2, action_dim) if rank is None else rank
+        self.rank = integer(1, action_dim)("rank", rank)
         self.noise_dim = action_dim + self.rank
         self.cov_factor = nn.Linear(context_dim, action_dim * self.rank)
 

@@ -46,11 +46,6 @@ class AffineCoupling(Coupling):
 
     .. math:: b \mapsto b \odot \exp(s(a, h)) + t(a, h)
 
-    Args:
-        passive: Number of coordinates that are read, at least 0.
-        active: Number of coordinates that are moved, at least 1.
-        hidden: Units of the hidden layers.
-
     References:
         Density estimation using Real NVP (Dinh et al., 2017), eq. 7.
     """

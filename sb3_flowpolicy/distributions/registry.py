@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
+from sb3_flowpolicy.common.validation import one_of
 from sb3_flowpolicy.distributions.base import ActionDistribution
 from sb3_flowpolicy.distributions.full_covariance import FullCovarianceGaussian
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
@@ -34,7 +34,7 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
             ``action_dim``, ``context_dim`` and keyword arguments of its own.
 
     Raises:
-        ValueError: If the name is taken or the class is not an ``ActionDistribution``.
+        ValueError: If the name is taken.
 
     Example:
         >>> from sb3_flowpolicy.distributions import DiagGaussian
@@ -47,13 +47,6 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
         >>> make_distribution("sharp", action_dim=2, context_dim=8).action_dim
         2
     """
-    if not (
-        isinstance(distribution_class, type) and issubclass(distribution_class, ActionDistribution)
-    ):
-        raise ValueError(
-            f"distribution_class must be a subclass of ActionDistribution, "
-            f"got {distribution_class!r}"
-        )
     if _REGISTRY.get(name, distribution_class) is not distribution_class:
         raise ValueError(f'name "{name}" is taken by {_REGISTRY[name].__name__}')
     _REGISTRY[name] = distribution_class
@@ -67,25 +60,11 @@ def registered_distributions() -> dict[str, type[ActionDistribution]]:
 def make_distribution(
     name: str, action_dim: int, context_dim: int, **distribution_kwargs: Any
 ) -> ActionDistribution:
-    """Build a registered density.
-
-    Args:
-        name: A registered name.
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
-        **distribution_kwargs: Passed to the density's constructor.
-
-    Returns:
-        The density of unsquashed actions.
+    """Build the density of unsquashed actions that is registered as ``name``.
 
     Raises:
-        ValueError: If the name or a keyword argument is unknown.
+        ValueError: If the name is unknown, or an argument is out of range.
+        TypeError: If the density's constructor takes no such keyword argument.
     """
-    if not isinstance(name, str) or name not in _REGISTRY:
-        raise ValueError(f"distribution must be one of {sorted(_REGISTRY)}, got {name!r}")
-    parameters = inspect.signature(_REGISTRY[name]).parameters
-    accepted = [p for p in parameters if p not in ("action_dim", "context_dim")]
-    unknown = sorted(set(distribution_kwargs) - set(accepted))
-    if unknown:
-        raise ValueError(f'distribution_kwargs of "{name}" must be among {accepted}, got {unknown}')
+    one_of(*_REGISTRY)("distribution", name)
     return _REGISTRY[name](action_dim, context_dim, **distribution_kwargs)

@@ -9,7 +9,8 @@ from typing import Literal
 import torch as th
 from torch.nn.functional import pad, softmax
 
-from sb3_flowpolicy.distributions.base import positive_int, soft_bound
+from sb3_flowpolicy.common.validation import integer
+from sb3_flowpolicy.distributions.base import soft_bound
 from sb3_flowpolicy.distributions.coupling import Coupling, CouplingFlow
 
 # A spline is the identity outside (-5, 5); tanh(5) = 0.9999 is almost the edge of the action box.
@@ -23,19 +24,11 @@ class Spline(CouplingFlow):
 
     A spline of K bins maps each coordinate within (-5, 5); outside it is the identity. A network
     computes the widths and heights of the bins and the slopes at the knots.
-    :class:`CouplingFlow` documents how the couplings alternate. With D = 1 a RealNVP is a normal
-    distribution, whereas this flow can have several modes.
+    With D = 1 a RealNVP is a normal distribution, whereas this flow can have several modes.
+    :class:`CouplingFlow` documents the other arguments and how the couplings alternate.
 
     Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
-        layers: As for :class:`CouplingFlow`.
-        hidden: As for :class:`CouplingFlow`.
-        init: As for :class:`CouplingFlow`.
         bins: Number of bins K, at least 2.
-
-    Raises:
-        ValueError: As :class:`CouplingFlow`, or if ``bins`` is not an integer of at least 2.
 
     References:
         Neural Spline Flows (Durkan et al., 2019); here without linear layers between couplings.
@@ -59,7 +52,7 @@ class Spline(CouplingFlow):
         init: Literal["identity", "default"] = "identity",
         bins: int = 8,
     ) -> None:
-        self.bins = positive_int("bins", bins, least=2)
+        self.bins = integer(2)("bins", bins)
         super().__init__(action_dim, context_dim, layers, hidden, init)
 
     def _make_coupling(self, passive: int, active: int) -> SplineCoupling:
@@ -73,12 +66,6 @@ class SplineCoupling(Coupling):
     s = h / w, slopes :math:`d_k` at the knots and :math:`z = (x - x_k) / w`:
 
     .. math:: y = y_k + h \frac{s z^2 + d_k z (1 - z)}{s + (d_k + d_{k+1} - 2 s) z (1 - z)}
-
-    Args:
-        passive: Number of coordinates that are read, at least 0.
-        active: Number of coordinates that are moved, at least 1.
-        hidden: Units of the hidden layers.
-        bins: Number of bins K, at least 2.
 
     References:
         Neural Spline Flows (Durkan et al., 2019), eqs. 4 to 8.

@@ -6,6 +6,8 @@ import argparse
 import pickle
 import sys
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +31,7 @@ _SUFFIXES = {"safe": SUFFIX, "onnx": ".onnx"}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Export the model that the command line names, and print the path of the result.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-    """
+    """Export the model that the command line names, and print the path of the result."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.export",
         description="Write a trained model to a file that can be shared safely (safe), or to one "
@@ -51,11 +49,9 @@ def main(arguments: list[str] | None = None) -> None:
         metavar="FILE",
         help="statistics to include (default: the vecnormalize.pkl that rl_zoo3 saved with MODEL)",
     )
-    add("--stochastic", action="store_true", help="onnx: also sample, with noise as an input")
+    add("--stochastic", action="store_true", help="onnx: also sample (a bundle always can)")
     args = parser.parse_args(arguments)
     try:
-        if args.stochastic and args.format == "safe":
-            raise ValueError("--stochastic is for onnx: a safe bundle can always sample")
         model = _load_model(args.model)
         statistics = args.vecnormalize
         # A bundle contains its statistics, so no pickle next to it is opened.
@@ -100,37 +96,31 @@ def find_statistics(model: Path) -> Path | None:
 
 
 def _load_model(path: Path) -> SACFlow:
-    if not path.is_file():
-        raise ValueError(f"MODEL must be a file that exists, got {path}")
     if not zipfile.is_zipfile(path):
         return SACFlow.load_safe(path, device="cpu")
     no_buffer: Any = object()
-    try:
+    with _explaining(f"{path} must be a model that SACFlow or SAC saved"):
         # Keeps SB3 from building a buffer, which HER cannot do without an environment.
         model = SACFlow.load(path, device="cpu", replay_buffer=no_buffer)
-    except Exception as error:  # pickles can raise anything
-        raise ValueError(
-            f"MODEL must be a model that SACFlow or SAC saved, got {path} "
-            f"({type(error).__name__}: {error})"
-        ) from error
     model.replay_buffer = None
     return model
 
 
 def _load_statistics(path: Path) -> VecNormalize:
-    try:
-        with path.open("rb") as file:
-            found = pickle.load(file)
-    except FileNotFoundError:
-        raise ValueError(f"--vecnormalize must be a file that exists, got {path}") from None
-    except Exception as error:  # pickles can raise anything
-        raise ValueError(
-            f"--vecnormalize must be what VecNormalize.save wrote, got {path} "
-            f"({type(error).__name__}: {error})"
-        ) from error
-    if not isinstance(found, VecNormalize):
-        raise ValueError(f"--vecnormalize must hold a VecNormalize, got {type(found).__name__}")
+    with path.open("rb") as file, _explaining(f"{path} must be what VecNormalize.save wrote"):
+        found = pickle.load(file)
+        if not isinstance(found, VecNormalize):
+            raise TypeError(f"it is a {type(found).__name__}")
     return found
+
+
+@contextmanager
+def _explaining(expectation: str) -> Iterator[None]:
+    """Turn all exceptions into ``ValueError``: pickles can raise any."""
+    try:
+        yield
+    except Exception as error:
+        raise ValueError(f"{expectation}, got {type(error).__name__}: {error}") from error
 
 
 if __name__ == "__main__":

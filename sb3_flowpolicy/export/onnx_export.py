@@ -85,9 +85,6 @@ def export_onnx(
         )
     normalization = normalization_of(model, vec_normalize)
     deployed = DeployedPolicy(policy, normalization, stochastic).cpu().eval()
-    names = [*deployed.inputs, *deployed.outputs]
-    if len(set(names)) < len(names):
-        raise ValueError(f"observation_space must have keys other than {names[-3:]}, got {names}")
     inputs = random_inputs(policy, stochastic, _N_CHECKED, np.random.default_rng(0))
     proto = _translate(deployed, [th.from_numpy(array[:2]) for array in inputs])
     _add_metadata(proto, model, normalization is not None, stochastic)

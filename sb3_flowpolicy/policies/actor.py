@@ -14,8 +14,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.sac.policies import Actor
 from torch import nn
 
+from sb3_flowpolicy.common.validation import integer
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
-from sb3_flowpolicy.distributions.base import positive_int
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # State dicts omit this prefix, so that the heads have the names of SB3's `mu` and `log_std`, and a
@@ -29,21 +29,15 @@ class FlowActor(Actor):
     .. math:: a = \tanh(u), \qquad u \sim p(\cdot \mid h), \qquad h = \mathrm{latent\_pi}(s)
 
     Actions are in SB3's scaled box [-1, 1]^D, flattened to (batch, D) whatever the shape of the
-    action space. All methods that sample accept the noise to use.
+    action space. All methods that sample accept the noise to use. The arguments are those of SB3's
+    ``Actor`` and two more.
 
     Args:
-        observation_space: Observation space.
-        action_space: Box with finite bounds.
-        net_arch: Units of the hidden layers that compute h.
-        features_extractor: Network that computes features of observations.
-        features_dim: Number of features.
-        activation_fn: Activation between the hidden layers.
-        normalize_images: Whether to divide images by 255.
         distribution: Name of a registered density.
         distribution_kwargs: Arguments of its constructor.
 
     Raises:
-        ValueError: If the density or one of its arguments is unknown.
+        ValueError: If the density is unknown or must not be built with these arguments.
     """
 
     density: TanhSquashed
@@ -119,12 +113,9 @@ class FlowActor(Actor):
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, noise: th.Tensor | None = None
     ) -> th.Tensor:
-        """Return actions in [-1, 1], shape (batch, D).
+        """Return the density's mode or a sample, in [-1, 1], shape (batch, D).
 
-        Args:
-            obs: Batch of observations.
-            deterministic: Whether to return the density's mode instead of a sample.
-            noise: Standard normals, shape (batch, M). Default: drawn here.
+        By default the noise is drawn here: standard normals, shape (batch, M).
         """
         if deterministic:
             return self.density.mode(self.context(obs))
@@ -134,10 +125,6 @@ class FlowActor(Actor):
         self, obs: PyTorchObs, noise: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
         """Sample reparametrized actions and score them in one pass.
-
-        Args:
-            obs: Batch of observations.
-            noise: Standard normals, shape (batch, M). Default: drawn here.
 
         Returns:
             Actions in [-1, 1], shape (batch, D), and their log-density, shape (batch,).
@@ -151,22 +138,17 @@ class FlowActor(Actor):
 
         Args:
             obs: Batch of observations.
-            action: Actions in SB3's scaled [-1, 1], shape (batch, D) or unflattened.
+            action: Actions in SB3's scaled [-1, 1], shape (batch, D) or unflattened;
+                ``policy.scale_action`` maps an environment's actions to this range.
 
         Returns:
             Log-density in nats, shape (batch,).
 
         Raises:
-            ValueError: If there is not one action per observation, or an action is outside
-                [-1, 1]; ``policy.scale_action`` maps an environment's actions to this range.
+            ValueError: If an action is outside [-1, 1].
         """
         context = self.context(obs)
         action = th.as_tensor(action, dtype=context.dtype, device=context.device)
-        if action.numel() != len(context) * self.density.action_dim:
-            raise ValueError(
-                f"action must have shape ({len(context)}, {self.density.action_dim}), "
-                f"got {tuple(action.shape)}"
-            )
         if (action.detach().abs() > 1 + 1e-4).any():
             raise ValueError(
                 "action must be scaled to [-1, 1], got values between "
@@ -176,26 +158,18 @@ class FlowActor(Actor):
 
     @th.no_grad()
     def entropy(self, obs: PyTorchObs, n_samples: int = 64) -> th.Tensor:
-        """Estimate the entropy of the squashed policy by Monte Carlo.
-
-        Args:
-            obs: Batch of observations.
-            n_samples: Number of samples per observation, at least 1.
+        """Estimate the entropy of the squashed policy from ``n_samples`` samples per observation.
 
         Returns:
             Entropy in nats, shape (batch,); at most D log 2, the value of the uniform distribution.
         """
         context = self.context(obs)
-        noise = self.draw_noise(context, positive_int("n_samples", n_samples))
+        noise = self.draw_noise(context, integer(1)("n_samples", n_samples))
         return -self.density.rsample_and_log_prob(context, noise)[1].mean(0)
 
     @th.no_grad()
     def action_correlation(self, obs: PyTorchObs, n_samples: int = 1024) -> th.Tensor:
         """Estimate Pearson's correlation of the action dimensions (thesis eq. 3.1).
-
-        Args:
-            obs: Batch of observations.
-            n_samples: Number of samples per observation.
 
         Returns:
             Correlation matrices, shape (batch, D, D), entries in [-1, 1].

@@ -18,13 +18,7 @@ from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 class CrossQFlowActor(FlowActor):
     """:class:`FlowActor` with CrossQ's batch renormalization before and after each hidden layer.
 
-    Args:
-        *args: As for :class:`FlowActor`.
-        batch_norm: Whether to use batch renormalization.
-        batch_norm_momentum: Weight of a new batch in the running statistics.
-        batch_norm_eps: Added to variances.
-        renorm_warmup_steps: Updates before the running statistics are used.
-        **kwargs: As for :class:`FlowActor`.
+    The further arguments are those of sb3-contrib's actor.
 
     References:
         CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).

@@ -19,20 +19,11 @@ _MOST_AT_ONCE = 2**16
 def best_actions(
     actor: FlowActor, critic: Any, obs: PyTorchObs, mode: str, n_candidates: int
 ) -> th.Tensor:
-    """Choose the best of several candidates for each observation.
+    """Choose the best of several candidates for each observation, without random numbers.
 
-    The candidates are the images of :func:`candidate_noise`, starting with the base mean. The first
-    of several equally good ones is taken. No random numbers are drawn: an observation always leads
-    to the same action.
-
-    Args:
-        actor: Actor with a density.
-        critic: Critics of the same policy.
-        obs: Batch of observations.
-        mode: ``"log_prob"`` takes the candidate with the largest density as a squashed action
-            (``actor.log_prob``); ``"q"`` the one with the largest value, where the value is the
-            minimum over the critics, as in SAC's loss.
-        n_candidates: Number of candidates N, at least 2.
+    The candidates are the images of :func:`candidate_noise`. ``"log_prob"`` takes the one with the
+    largest density as a squashed action; ``"q"`` the one with the largest value, the minimum over
+    the critics. The first of several equally good ones is taken.
 
     Returns:
         Actions in [-1, 1], (batch, D).
@@ -56,15 +47,9 @@ def best_actions(
 
 
 def critic_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Return the values that the critics of SAC, TQC or CrossQ assign to actions.
+    """Return the values (n_critics, ...) that the critics of SAC, TQC or CrossQ assign to actions.
 
-    Args:
-        critic: Critics of a policy.
-        features: Features of the observations, from the critics' extractor, (..., F).
-        actions: Actions in [-1, 1], (..., D).
-
-    Returns:
-        Values, (n_critics, ...).
+    Shapes: features of the critics' extractor (..., F); actions in [-1, 1] (..., D).
     """
     pairs = th.cat([features, actions], dim=-1)
     # A network returns one value, or quantiles whose mean is the value.
@@ -73,14 +58,7 @@ def critic_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Te
 
 @lru_cache(maxsize=8)
 def candidate_noise(n_candidates: int, noise_dim: int) -> th.Tensor:
-    """Return zero, which is the base mean, and Sobol points distributed like standard normals.
-
-    Args:
-        n_candidates: Number of points N, at least 2.
-        noise_dim: Dimension M of the noise.
-
-    Returns:
-        The points, (N, M), the same in every call.
+    """Return zero, which is the base mean, and N - 1 Sobol points as standard normals, (N, M).
 
     Example:
         >>> candidate_noise(64, 2).mean(0).abs().max() < 0.1

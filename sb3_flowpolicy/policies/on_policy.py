@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_flowpolicy.common.validation import mapping, optional
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
-from sb3_flowpolicy.policies.extractors import check_observation_space, with_forms
-from sb3_flowpolicy.policies.off_policy import check_finite_actions, check_net_arch
+from sb3_flowpolicy.policies.base import (
+    DensityPolicy,
+    check_action_space,
+    check_finite,
+    check_net_arch,
+    with_forms,
+)
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
 # Arguments of SB3's Gaussian head, which is not built.
@@ -27,7 +29,7 @@ _UNUSED = {"use_sde", "log_std_init", "full_std", "use_expln", "squash_output"}
 _LARGEST_GRADIENT = 1e6
 
 
-class DensityActorCritic(ActorCriticPolicy):
+class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
     """Actor-critic policy with a registered density as its action distribution.
 
     Both while collecting and while learning, the log-probability of an action is computed with the
@@ -36,15 +38,14 @@ class DensityActorCritic(ActorCriticPolicy):
     The entropy bonus is a Monte Carlo estimate whose gradient reaches all parameters.
 
     Args:
-        observation_space: Observation space.
+        observation_space: As for SB3's policy classes.
         action_space: Box of any shape; with finite bounds if ``squash_output``.
-        lr_schedule: Learning rate schedule.
+        lr_schedule: As for SB3's policy classes.
         distribution: Name of a registered density. Default: that of the policy class.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
         squash_output: Whether to squash actions with tanh and rescale them to the action space.
             Otherwise they are clipped to it, as SB3 does by default.
-        **policy_kwargs: Other arguments of SB3's ``ActorCriticPolicy``: ``net_arch``,
-            ``activation_fn``, ``ortho_init``, ``features_extractor_class``, ...
+        **policy_kwargs: Other arguments of SB3's ``ActorCriticPolicy``.
 
     Raises:
         ValueError: If the action space is not a Box (with finite bounds), the density is unknown,
@@ -54,9 +55,6 @@ class DensityActorCritic(ActorCriticPolicy):
         Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5, which
         proposes these densities for on-policy algorithms.
     """
-
-    default_distribution: ClassVar[str]
-    default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -70,12 +68,7 @@ class DensityActorCritic(ActorCriticPolicy):
         use_sde: bool = False,
         **policy_kwargs: Any,
     ) -> None:
-        if not isinstance(action_space, spaces.Box):
-            raise ValueError(f"action_space must be a Box, got {action_space}")
-        if squash_output and not np.isfinite([action_space.low, action_space.high]).all():
-            raise ValueError(
-                f"action_space must have finite bounds for squashed actions, got {action_space}"
-            )
+        check_action_space(action_space, bounded=squash_output)
         unused = sorted(policy_kwargs.keys() & _UNUSED)
         if use_sde or unused:
             raise ValueError(
@@ -85,16 +78,8 @@ class DensityActorCritic(ActorCriticPolicy):
         net_arch = policy_kwargs.get("net_arch")
         if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], Mapping):
             net_arch = net_arch[0]  # the form before SB3 1.8, which SB3 accepts with a warning
-        check_net_arch(net_arch, "vf", both=False)
-        extractor = policy_kwargs.setdefault(
-            "features_extractor_class", self.default_features_extractor_class
-        )
-        check_observation_space(observation_space, extractor)
-        # Plain attributes before super().__init__(), which builds the networks.
-        self.distribution = self.default_distribution if distribution is None else distribution
-        self.distribution_kwargs = dict(
-            optional(mapping)("distribution_kwargs", distribution_kwargs) or {}
-        )
+        check_net_arch(net_arch, set(), {"pi", "vf"})
+        self._set_density(observation_space, policy_kwargs, distribution, distribution_kwargs)
         self._squashes = squash_output
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
         # SB3's constructor accepts squash_output with gSDE only, but the rest of SB3 supports it.
@@ -113,13 +98,9 @@ class DensityActorCritic(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(parameters, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
-        """Return actions, values and log-probabilities, as SB3 does.
-
-        Raises:
-            ValueError: If an action is not finite, because an observation or a weight is not.
-        """
+        """Return actions, which must be finite, values and log-probabilities, as SB3 does."""
         found = super().forward(*args, **kwargs)
-        check_finite_actions(found[0].detach().cpu().numpy())
+        check_finite(found[0].detach().cpu().numpy())
         return found
 
     def evaluate_actions(self, *args: Any, **kwargs: Any) -> Any:
@@ -129,43 +110,20 @@ class DensityActorCritic(ActorCriticPolicy):
         float32 is coarse, so a stored action may lie many standard deviations from the one that was
         drawn. In a narrow distribution one update can then raise its log-probability by a hundred,
         which makes PPO's ratio infinite and its gradient NaN.
-
-        Raises:
-            ValueError: If a log-probability is not finite.
         """
         found = super().evaluate_actions(*args, **kwargs)
-        if not found[1].isfinite().all():
-            raise ValueError(
-                "observations and weights must be finite, got log-probabilities with NaN or "
-                "infinity"
-            )
+        check_finite(found[1].detach().cpu().numpy(), "log-probabilities")
         if found[1].requires_grad:
             found[1].register_hook(_bounded)
         return found
-
-    def predict(self, *args: Any, **kwargs: Any) -> Any:
-        """Choose actions, as SB3's policies do.
-
-        Raises:
-            ValueError: If an action is NaN, because an observation or a weight is not finite.
-        """
-        actions, state = super().predict(*args, **kwargs)
-        check_finite_actions(actions)
-        return actions, state
 
     def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
         return self.action_dist.proba_distribution(latent_pi)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        return {
-            **{name: value for name, value in data.items() if name not in _UNUSED},
-            "distribution": self.distribution,
-            "distribution_kwargs": self.distribution_kwargs,
-            "squash_output": self._squashes,
-            # SB3 omits it: a policy that shares its extractor would be loaded as one that does not.
-            "share_features_extractor": self.share_features_extractor,
-        }
+        used = {name: value for name, value in data.items() if name not in _UNUSED}
+        return {**used, "squash_output": self._squashes}
 
 
 def _bounded(gradient: th.Tensor) -> th.Tensor:

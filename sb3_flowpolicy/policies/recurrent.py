@@ -12,14 +12,8 @@ from sb3_flowpolicy.policies.on_policy import FlowActorCriticPolicy
 class FlowLstmPolicy(FlowActorCriticPolicy, RecurrentActorCriticPolicy):
     """:class:`FlowActorCriticPolicy` with the memory of ``RecurrentActorCriticPolicy``.
 
-    Args:
-        *args: As for :class:`FlowActorCriticPolicy`.
-        squash_output: False: ``RecurrentPPO`` clips the actions that it collects to the action
-            space and would not rescale squashed ones.
-        **kwargs: As for :class:`FlowActorCriticPolicy` and ``RecurrentActorCriticPolicy``.
-
-    Raises:
-        ValueError: If ``squash_output`` is not False.
+    ``squash_output`` must be False: ``RecurrentPPO`` clips the actions that it collects to the
+    action space and would not rescale squashed ones.
 
     Example:
         >>> from sb3_contrib import RecurrentPPO

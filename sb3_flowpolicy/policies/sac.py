@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_flowpolicy.policies.extractors import with_forms
+from sb3_flowpolicy.policies.base import with_forms
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 

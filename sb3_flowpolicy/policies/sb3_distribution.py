@@ -29,7 +29,7 @@ class ActionDistributionAdapter(Distribution):
     def __init__(self, density: ActionDistribution) -> None:
         super().__init__()
         self.density = density
-        self.context: th.Tensor | None = None
+        self.context: th.Tensor
 
     def proba_distribution_net(self) -> ActionDistribution:
         """Return the module that holds the parameters."""
@@ -42,7 +42,7 @@ class ActionDistributionAdapter(Distribution):
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """Score ``actions`` (batch, D): shape (batch,)."""
-        return self.density.log_prob(self._conditioned(), actions)
+        return self.density.log_prob(self.context, actions)
 
     def entropy(self) -> th.Tensor:
         """Estimate the entropy by Monte Carlo, with gradient: shape (batch,).
@@ -50,17 +50,17 @@ class ActionDistributionAdapter(Distribution):
         Squashed densities and flows have no closed form. Noise is drawn in pairs of opposite sign,
         which cancels the terms of the error that are odd in it.
         """
-        context = self._conditioned()
-        noise = self.density.draw_noise(context, ENTROPY_PAIRS)
-        return -self.density.rsample_and_log_prob(context, th.cat([noise, -noise]))[1].mean(0)
+        noise = self.density.draw_noise(self.context, ENTROPY_PAIRS)
+        noise = th.cat([noise, -noise])
+        return -self.density.rsample_and_log_prob(self.context, noise)[1].mean(0)
 
     def sample(self) -> th.Tensor:
         """Draw a reparametrized sample, shape (batch, D)."""
-        return self._sample_and_log_prob()[0]
+        return self.log_prob_from_params(self.context)[0]
 
     def mode(self) -> th.Tensor:
         """Return the deterministic action, shape (batch, D)."""
-        return self.density.mode(self._conditioned())
+        return self.density.mode(self.context)
 
     def actions_from_params(self, context: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """Condition on ``context`` and return the mode or a sample, shape (batch, D)."""
@@ -68,13 +68,5 @@ class ActionDistributionAdapter(Distribution):
 
     def log_prob_from_params(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Condition on ``context``, sample and score: (batch, D) and (batch,)."""
-        return self.proba_distribution(context)._sample_and_log_prob()
-
-    def _sample_and_log_prob(self) -> tuple[th.Tensor, th.Tensor]:
-        context = self._conditioned()
+        self.context = context
         return self.density.rsample_and_log_prob(context, self.density.draw_noise(context))
-
-    def _conditioned(self) -> th.Tensor:
-        if self.context is None:
-            raise ValueError("context must be set by proba_distribution() first, got None")
-        return self.context

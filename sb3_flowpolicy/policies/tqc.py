@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sb3_contrib.tqc.policies import TQCPolicy
 
-from sb3_flowpolicy.policies.extractors import with_forms
+from sb3_flowpolicy.policies.base import with_forms
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 

@@ -26,15 +26,10 @@ _MARK = "_knows_sb3_flowpolicy"
 def hyperparameter_file(algorithm: str) -> Path:
     """Return the path of the YAML file that rl_zoo3 reads without `-conf`.
 
-    Args:
-        algorithm: One of `ALGORITHMS`.
-
     Example:
         >>> hyperparameter_file("sac_flow").name
         'sac_flow.yml'
     """
-    if algorithm not in ALGORITHMS:
-        raise ValueError(f"algorithm must be one of {ALGORITHMS}, got {algorithm!r}")
     package = importlib.import_module("zoo_hyperparams")
     return Path(package.__path__[0], f"{algorithm}.yml")
 
@@ -69,21 +64,17 @@ def _plug_into_utils(module: ModuleType) -> None:
 
 
 def _plug_into_hyperparams_opt(module: ModuleType) -> None:
-    from sb3_flowpolicy.zoo.samplers import CONVERTERS, SAMPLERS, refuse
+    from sb3_flowpolicy.zoo.samplers import CONVERTERS, SAMPLERS
 
-    module.HYPERPARAMS_SAMPLER.update({**SAMPLERS, "crossq_flow": refuse})
+    module.HYPERPARAMS_SAMPLER.update(SAMPLERS)
     module.HYPERPARAMS_CONVERTER.update(CONVERTERS)
 
 
 def _plug_into_exp_manager(module: ModuleType) -> None:
-    manager = module.ExperimentManager
-    if not getattr(manager.__init__, _MARK, False):
-        manager.__init__ = _with_our_files(manager.__init__)
-        setattr(manager.__init__, _MARK, True)
-
-
-def _with_our_files(init: Callable[..., None]) -> Callable[..., None]:
     """Wrap `ExperimentManager.__init__`, which looks for default files in rl_zoo3 only."""
+    init = module.ExperimentManager.__init__
+    if hasattr(init, _MARK):
+        return
     signature = inspect.signature(init)
 
     @functools.wraps(init)
@@ -94,7 +85,8 @@ def _with_our_files(init: Callable[..., None]) -> Callable[..., None]:
             call.arguments["config"] = str(hyperparameter_file(algorithm))
         init(*call.args, **call.kwargs)
 
-    return wrapped
+    setattr(wrapped, _MARK, True)
+    module.ExperimentManager.__init__ = wrapped
 
 
 _PLUGS: dict[str, Callable[[ModuleType], None]] = {

@@ -27,10 +27,6 @@ _TUNED = ("layers", "hidden", "rank")
 def convert(params: dict[str, Any], off_policy: bool = True) -> dict[str, Any]:
     """Turn the parameters of a trial into keyword arguments of the algorithm.
 
-    Args:
-        params: `trial.params` of a trial that one of `SAMPLERS` filled.
-        off_policy: False for PPO.
-
     Example:
         >>> params = dict(one_minus_gamma=0.02, net_arch="small", rank=3)
         >>> convert(params)["policy_kwargs"]
@@ -109,8 +105,3 @@ SAMPLERS: dict[str, Sampler] = {
 CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     name: partial(convert, off_policy=not name.startswith("ppo")) for name in SAMPLERS
 }
-
-
-def refuse(*_: Any) -> dict[str, Any]:
-    """Raise `ValueError`: there is no search space for CrossQ."""
-    raise ValueError(f"--algo must be one of {list(CONVERTERS)} to --optimize, got 'crossq_flow'")

@@ -26,9 +26,6 @@ def load_run(args: argparse.Namespace) -> tuple[BaseAlgorithm, VecEnv, Path]:
 
     Returns:
         The model, one environment that renders `rgb_array`, and the model's file.
-
-    Raises:
-        ValueError: If there is no such model.
     """
     register()
     from huggingface_sb3 import EnvironmentName
@@ -38,17 +35,12 @@ def load_run(args: argparse.Namespace) -> tuple[BaseAlgorithm, VecEnv, Path]:
 
     set_random_seed(args.seed)
     if args.model is not None:
-        if not args.model.is_file():
-            raise ValueError(f"model must be a file that exists, got {args.model}")
         env = make_vec_env(args.env, seed=args.seed, env_kwargs={"render_mode": "rgb_array"})
         return ALGOS[args.algo].load(args.model, device="cpu"), env, args.model
     env_name = EnvironmentName(args.env)
-    try:
-        _, model_path, log_path = get_model_path(
-            args.exp_id, args.folder, args.algo, env_name, args.load_best
-        )
-    except AssertionError as error:
-        raise ValueError(f"folder must hold a run of {args.algo} on {args.env}: {error}") from error
+    _, model_path, log_path = get_model_path(
+        args.exp_id, args.folder, args.algo, env_name, args.load_best
+    )
     hyperparams, stats_path = get_saved_hyperparams(str(Path(log_path, env_name)), test_mode=True)
     env = create_test_env(
         env_name.gym_id,

@@ -112,7 +112,7 @@ def test_on_policy_algorithms_have_no_colored_noise() -> None:
         ({"learning_rate": -1.0}, "learning_rate must be at least 0, got -1.0"),
         ({"policy": FlowPolicy}, "policy must be one of .* got FlowPolicy"),
         ({"policy": FlowActorCriticPolicy}, "policy must be one of .* got FlowActorCriticPolicy"),
-        ({"policy_kwargs": {"n_critics": 0}}, "n_critics must be an integer >= 1, got 0"),
+        ({"policy_kwargs": {"n_critics": 0}}, "n_critics must be an integer of at least 1, got 0"),
     ],
 )
 def test_bad_arguments(algorithm: Any, arguments: dict[str, Any], message: str) -> None:
@@ -129,7 +129,7 @@ def test_bad_arguments_of_one_algorithm() -> None:
             make(TQCFlow, top_quantiles_to_drop_per_net=dropped)
     with pytest.raises(ValueError, match="top_quantiles_to_drop_per_net must be an integer of at"):
         make(TQCFlow, top_quantiles_to_drop_per_net=1.5)
-    with pytest.raises(ValueError, match="n_quantiles must be an integer >= 1, got 0"):
+    with pytest.raises(ValueError, match="n_quantiles must be an integer of at least 1, got 0"):
         make(TQCFlow, policy_kwargs={"n_quantiles": 0})
     with pytest.raises(ValueError, match="batch_norm_momentum must be at most 1, got 5"):
         make(CrossQFlow, policy_kwargs={"batch_norm_momentum": 5})

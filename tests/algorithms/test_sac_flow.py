@@ -166,8 +166,9 @@ def test_demonstrations_that_do_not_fit() -> None:
     other = SACFlow("MultiInputFlowPolicy", multi, **FAST)
     with pytest.raises(ValueError, match="need a replay buffer for array observations"):
         other.add_demonstrations(demos())
-    with pytest.raises(ValueError, match="n_steps must be at least 1, got 0"):
-        record_demonstrations(gym.make("Pendulum-v1"), lambda obs: np.zeros(1), 0)
+    none = record_demonstrations(gym.make("Pendulum-v1"), lambda obs: np.zeros(1), 0)
+    with pytest.raises(ValueError, match="must have equally many rows, at least 1"):
+        load_demonstrations(none)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +176,11 @@ def test_demonstrations_that_do_not_fit() -> None:
     [
         ("observations", lambda rows: rows[:, :1], r"observations of shape \(N, \*\(3,\)\), got"),
         ("actions", lambda rows: rows * 100, r"actions within Box.*got 50.0 \.\.\. 50.0"),
-        ("rewards", lambda rows: rows * np.nan, "finite, got NaN or infinity in rewards"),
+        (
+            "rewards",
+            lambda rows: rows * np.nan,
+            "got NaN, infinity or no numbers in rewards",
+        ),
     ],
 )
 def test_demonstrations_are_checked(key: str, change: Any, message: str) -> None:
@@ -218,14 +223,14 @@ def test_demonstrations_may_be_a_recipe() -> None:
     assert buffer.actions[0, 0] == pytest.approx([-0.65, 0, 0, -0.65, 0.65, 0, 0, 0.65])
     # The second episode starts where the first was truncated.
     assert buffer.timeouts[79, 0]
-    with pytest.raises(ValueError, match=r"controller must be the import path .* 'nowhere.Nobody'"):
+    with pytest.raises(ImportError, match="No module named 'nowhere'"):
         SACFlow(
             "FlowPolicy",
             "SquareMove-v0",
             demonstrations={"controller": "nowhere.Nobody", "n_steps": 9},
             **FAST,
         ).learn(1)
-    with pytest.raises(ValueError, match=r"demonstrations must have the keys .*got"):
+    with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'n_steps'"):
         SACFlow("FlowPolicy", "SquareMove-v0", demonstrations={"controller": "a.b"}, **FAST).learn(
             1
         )

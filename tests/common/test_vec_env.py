@@ -55,7 +55,7 @@ def test_agents_train_in_it() -> None:
 
 
 def test_what_it_refuses() -> None:
-    with pytest.raises(ValueError, match="env_id must have a vectorised form, got 'Acrobot-v1'"):
+    with pytest.raises(gym.error.Error, match="doesn't have a vector entry point"):
         make_batched_env("Acrobot-v1")
     venv = gym.make_vec("SquareHold-v0", 2, vectorization_mode="vector_entry_point")
     with pytest.raises(ValueError, match="venv must reset in the same step, got autoreset_mode"):

@@ -94,10 +94,10 @@ def test_normalised_and_dictionary_observations() -> None:
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ({"log_freq": 0}, "log_freq must be at least 1, got 0"),
-        ({"image_freq": -1}, "image_freq must be at least 0, got -1"),
-        ({"n_states": 0}, "n_states must be at least 1, got 0"),
-        ({"n_samples": 1}, "n_samples must be at least 2, got 1"),
+        ({"log_freq": 0}, "log_freq must be an integer of at least 1, got 0"),
+        ({"image_freq": -1}, "image_freq must be an integer of at least 0, got -1"),
+        ({"n_states": 0}, "n_states must be an integer of at least 1, got 0"),
+        ({"n_samples": 1}, "n_samples must be an integer of at least 2, got 1"),
     ],
 )
 def test_bad_arguments(argument: dict[str, int], message: str) -> None:

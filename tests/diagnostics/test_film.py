@@ -10,7 +10,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.diagnostics.curves import curves_figure, main, read_evaluations
+from sb3_flowpolicy.diagnostics.curves import curves_figure, main
 from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
 
 pytest.importorskip("matplotlib")
@@ -42,7 +42,7 @@ def test_sequences_show_consecutive_steps(frames: list[np.ndarray]) -> None:
     assert [axes.get_title() for axes in figure.axes] == ["step 1", "step 2", "step 3"]
     for k, axes in enumerate(figure.axes):
         assert np.array_equal(axes.images[0].get_array(), frames[1 + k])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="within the episode's 5 steps, got 4 and 2"):
+    with pytest.raises(IndexError):
         sequence_figure(frames, first=4, n_steps=2)
 
 
@@ -54,17 +54,17 @@ def test_videos_hold_all_frames(frames: list[np.ndarray], tmp_path: Path) -> Non
         assert clip.size == [64, 64]
         assert clip.duration == pytest.approx(len(frames) / 4)
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
-    with pytest.raises(ValueError, match=r"path must end in .mp4 and frames not be empty"):
-        write_video(frames, tmp_path / "film.gif", fps=4)
+    with pytest.raises(ValueError, match="couldn't find the codec"):
+        write_video(frames, tmp_path / "film.text", fps=4)
 
 
 def test_curves_show_every_seed_and_the_mean(tmp_path: Path) -> None:
     path = tmp_path / "evaluations.csv"
     path.write_text("seed,step,test_return,std\n1,10,2,0\n2,10,4,0\n1,20,6,0\n2,20,8,0\n")
-    lines = curves_figure({"a": read_evaluations(path)}).axes[0].lines
+    lines = curves_figure({"a": path}).axes[0].lines
     assert [list(line.get_ydata()) for line in lines] == [[2, 6], [4, 8], [3, 7]]
     main([f"a={path}", "-o", str(tmp_path / "curves.png")])
     assert (tmp_path / "curves.png").stat().st_size > 1000
-    path.write_text("seed,step\n")
-    with pytest.raises(ValueError, match="evaluations must start with 'seed,step,test_return,std'"):
-        read_evaluations(path)
+    path.write_text("seed,step\n1,10\n")
+    with pytest.raises(ValueError, match="no field of name test_return"):
+        curves_figure({"a": path})

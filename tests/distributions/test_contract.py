@@ -221,7 +221,7 @@ def test_wrong_shapes_are_named(density: ActionDistribution) -> None:
 
 @pytest.mark.parametrize("name", registered_distributions())
 def test_dimensions_must_be_positive(name: str) -> None:
-    with pytest.raises(ValueError, match="action_dim must be an integer >= 1, got 0"):
+    with pytest.raises(ValueError, match="action_dim must be an integer of at least 1, got 0"):
         registered_distributions()[name](0, 3)
-    with pytest.raises(ValueError, match="context_dim must be an integer >= 1, got -1"):
+    with pytest.raises(ValueError, match="context_dim must be an integer of at least 1, got -1"):
         registered_distributions()[name](2, -1)

@@ -134,11 +134,11 @@ def test_any_two_coordinates_meet_in_different_halves(features: int) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"layers": 0}, "layers must be an integer >= 1, got 0"),
-        ({"hidden": ()}, "hidden must be a non-empty sequence of integers"),
-        ({"hidden": 10}, "hidden must be a non-empty sequence of integers, got 10"),
-        ({"hidden": (10, 0)}, "hidden must be an integer >= 1, got 0"),
-        ({"init": "zeros"}, 'init must be "identity" or "default", got \'zeros\''),
+        ({"layers": 0}, "layers must be an integer of at least 1, got 0"),
+        ({"hidden": ()}, "hidden must be a list of layer sizes, at least 1"),
+        ({"hidden": 10}, "hidden must be a list of layer sizes, at least 1, got 10"),
+        ({"hidden": (10, 0)}, "hidden must be an integer of at least 1, got 0"),
+        ({"init": "zeros"}, "init must be one of .*'identity', 'default'.*, got 'zeros'"),
     ],
 )
 def test_bad_arguments(kwargs: dict, message: str) -> None:

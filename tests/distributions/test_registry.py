@@ -19,13 +19,12 @@ class Mine(DiagGaussian):
 
 
 def test_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"distribution must be one of \['full_cov.*got 'nvp'"):
+    with pytest.raises(ValueError, match=r"distribution must be one of .*'full_cov.*got 'nvp'"):
         make_distribution("nvp", 2, 3)
 
 
-def test_misspelt_kwargs_list_the_accepted_ones() -> None:
-    message = r'distribution_kwargs of "realnvp" must be among \[.*layers.*\], got \[\'layer\'\]'
-    with pytest.raises(ValueError, match=message):
+def test_unknown_arguments_are_refused_by_python() -> None:
+    with pytest.raises(TypeError, match="unexpected keyword argument 'layer'"):
         make_distribution("realnvp", 2, 3, layer=4)
 
 
@@ -45,9 +44,3 @@ def test_register_and_build(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_names_are_not_stolen() -> None:
     with pytest.raises(ValueError, match='name "realnvp" is taken by RealNVP'):
         register_distribution("realnvp", Mine)
-
-
-@pytest.mark.parametrize("wrong", [object, 3, DiagGaussian(2, 3)])
-def test_only_densities_are_registered(wrong: object) -> None:
-    with pytest.raises(ValueError, match="must be a subclass of ActionDistribution"):
-        register_distribution("wrong", wrong)  # type: ignore[arg-type]

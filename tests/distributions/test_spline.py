@@ -156,11 +156,11 @@ def test_far_away_points_score_as_a_normal_would() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"bins": 1}, "bins must be an integer >= 2, got 1"),
-        ({"bins": 4.0}, "bins must be an integer >= 2, got 4.0"),
-        ({"layers": 0}, "layers must be an integer >= 1, got 0"),
-        ({"hidden": ()}, "hidden must be a non-empty sequence of integers"),
-        ({"init": "zeros"}, 'init must be "identity" or "default", got \'zeros\''),
+        ({"bins": 1}, "bins must be an integer of at least 2, got 1"),
+        ({"bins": 4.0}, "bins must be an integer of at least 2, got 4.0"),
+        ({"layers": 0}, "layers must be an integer of at least 1, got 0"),
+        ({"hidden": ()}, "hidden must be a list of layer sizes, at least 1"),
+        ({"init": "zeros"}, "init must be one of .*'identity', 'default'.*, got 'zeros'"),
     ],
 )
 def test_bad_arguments(kwargs: dict, message: str) -> None:

@@ -86,7 +86,7 @@ def test_a_folder_of_unknown_origin_is_refused(tmp_path: Path, files: ItemFiles)
     with pytest.raises(ValueError, match=r"must be new or have its settings\.json"):
         claim_folder(tmp_path, {"steps": 100})
     (tmp_path / "settings.json").write_text("{")
-    with pytest.raises(ValueError, match=r"settings\.json must be JSON, got an error in line 1"):
+    with pytest.raises(ValueError, match=r"settings\.json must be JSON, got Expecting"):
         claim_folder(tmp_path, {"steps": 100})
 
 

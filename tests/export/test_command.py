@@ -79,18 +79,20 @@ def test_where_statistics_are_looked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["safe", "nowhere.zip"], "MODEL must be a file that exists, got nowhere.zip"),
+        (["safe", "nowhere.zip"], "No such file or directory: 'nowhere.zip'"),
         (["safe", "text.zip"], "text.zip must be a bundle written by save_safe: a header of"),
-        (["onnx", "empty.zip"], "MODEL must be a model that SACFlow or SAC saved, got empty.zip"),
+        (["onnx", "empty.zip"], "empty.zip must be a model that SACFlow or SAC saved, got "),
         (["onnx", "stock.zip"], "model must have a policy of sb3_flowpolicy"),
         (["safe", "stock.zip"], "policy_class must be one of"),
-        (["safe", "model.zip", "--stochastic"], "--stochastic is for onnx"),
-        (["safe", "model.zip", "--vecnormalize", "x"], "--vecnormalize must be a file that exists"),
+        (["safe", "model.zip", "--vecnormalize", "x"], "No such file or directory: 'x'"),
         (
             ["safe", "model.zip", "--vecnormalize", "text.zip"],
             "must be what VecNormalize.save wrote",
         ),
-        (["safe", "model.zip", "--vecnormalize", "list.pkl"], "must hold a VecNormalize, got list"),
+        (
+            ["safe", "model.zip", "--vecnormalize", "list.pkl"],
+            "got TypeError: it is a list",
+        ),
     ],
 )
 def test_errors_are_one_line_and_exit_with_two(

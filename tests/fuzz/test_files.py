@@ -99,7 +99,7 @@ def test_demonstrations_are_never_unpickled(tmp_path: Path) -> None:
     assert trace.exists()  # or the test would prove nothing
 
 
-def test_arrays_that_promise_more_than_they_have_are_not_allocated(tmp_path: Path) -> None:
+def test_arrays_that_promise_more_than_they_have_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "demos.npz"
     head = {"descr": "<f8", "fortran_order": False, "shape": (2**40,)}
     with zipfile.ZipFile(path, "w") as archive:
@@ -107,7 +107,7 @@ def test_arrays_that_promise_more_than_they_have_are_not_allocated(tmp_path: Pat
             member = io.BytesIO()
             np.lib.format.write_array_header_1_0(member, head)
             archive.writestr(f"{key}.npy", member.getvalue())
-    with pytest.raises(ValueError, match=r"bytes for float64 of shape \(1099511627776,\)"):
+    with pytest.raises(ValueError, match=r"must be an \.npz file of arrays of numbers"):
         load_demonstrations(path)
 
 

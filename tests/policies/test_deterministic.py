@@ -164,8 +164,11 @@ def test_candidates_lie_like_standard_normals() -> None:
     [
         ({"deterministic_mode": "mean"}, r"deterministic_mode must be one of .* got 'mean'"),
         ({"deterministic_mode": None}, r"deterministic_mode must be one of .* got None"),
-        ({"deterministic_samples": 1}, "deterministic_samples must be an integer >= 2, got 1"),
-        ({"deterministic_samples": 2.5}, "deterministic_samples must be an integer >= 2, got 2.5"),
+        (
+            {"deterministic_samples": 1},
+            "deterministic_samples must be an integer .* got 1",
+        ),
+        ({"deterministic_samples": 2.5}, "deterministic_samples must be an integer .* got 2.5"),
     ],
 )
 def test_bad_settings(kwargs: dict, message: str) -> None:
@@ -174,7 +177,7 @@ def test_bad_settings(kwargs: dict, message: str) -> None:
 
 
 def test_gsde_has_no_candidates() -> None:
-    message = "deterministic_mode must be \"base\" with use_sde=True, got 'q'"
+    message = r"deterministic_mode must be one of \('base',\), got 'q'"
     with pytest.raises(ValueError, match=message):
         SACFlow(
             "GaussPolicy",

@@ -98,8 +98,3 @@ def test_table_3_1(algorithm, env_id):
         "random_steps": 10**4,
         "critic_loss_coef": 1.0,
     }
-
-
-def test_the_algorithm_must_be_ours():
-    with pytest.raises(ValueError, match=r"algorithm must be one of .* got 'sac'"):
-        hyperparameter_file("sac")

@@ -29,12 +29,6 @@ def sample(algorithm, study, n_actions=2):
     return trial, SAMPLERS[algorithm](trial, n_actions, 1, dict(ADDITIONAL))
 
 
-def test_crossq_has_no_search_space() -> None:
-    hyperparams_opt = pytest.importorskip("rl_zoo3.hyperparams_opt")
-    with pytest.raises(ValueError, match=r"'tqc_flow'.* to --optimize, got 'crossq_flow'"):
-        hyperparams_opt.HYPERPARAMS_SAMPLER["crossq_flow"](None, 1, 1, {})
-
-
 @pytest.mark.parametrize("algorithm", SAMPLERS)
 def test_a_trial_turns_back_into_what_was_sampled(algorithm, study):
     for _ in range(5):
