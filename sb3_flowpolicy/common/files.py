@@ -15,9 +15,6 @@ from typing import Any
 def replacing(path: Path) -> Iterator[Path]:
     """Write a file completely or not at all: an interruption leaves what was there before.
 
-    Args:
-        path: The file; its folder exists.
-
     Yields:
         Path of a temporary file with the same suffix in the same folder, which replaces the file
         when the block ends without an exception.
@@ -54,15 +51,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Read an object.
-
-    Args:
-        path: File to read.
-        fields: What it has to hold, see :func:`require`.
-
-    Raises:
-        ValueError: If the file holds no object, or one without these fields.
-    """
+    """Read a JSON object with these fields; see :func:`require`."""
     try:
         content = json.loads(path.read_text())
     except (ValueError, RecursionError) as error:  # other encodings, a hundred thousand brackets
@@ -72,15 +61,10 @@ def read_json(path: Path, fields: Mapping[str, Any] | None = None) -> dict[str, 
 
 
 def require(where: str, content: Any, fields: Mapping[str, Any]) -> None:
-    """Check that ``content`` is an object with these fields.
-
-    Args:
-        where: File, and place in it, for the message.
-        content: What was read.
-        fields: Name to type, or to the fields of a nested object.
+    """Check that ``content`` is an object with these fields: name -> type, or nested fields.
 
     Raises:
-        ValueError: If a field is missing or of another type.
+        ValueError: If a field is missing or of another type; the message begins with ``where``.
 
     Example:
         >>> require("done.json", {"steps": 3, "machine": {}}, {"steps": int, "machine": dict})

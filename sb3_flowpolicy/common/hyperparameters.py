@@ -14,17 +14,13 @@ _FOR_THE_ZOO = ("callback", "env_wrapper", "normalize")
 
 
 def load_hyperparameters(algo: str, env_id: str) -> dict[str, Any]:
-    """Return the block of an algorithm and environment.
-
-    Args:
-        algo: ``"sac_flow"``, ``"sac_lowrank"`` or ``"sac_gauss"``.
-        env_id: Environment; one that the file does not list gets its ``default`` block.
+    """Return the block of an algorithm and environment, or of ``default`` for other environments.
 
     Returns:
         Arguments of :class:`SACFlow`, ``policy`` among them, and ``n_timesteps``.
 
     Raises:
-        ValueError: If there is no file for the algorithm.
+        ValueError: If ``algo`` is not ``"sac_flow"``, ``"sac_lowrank"`` or ``"sac_gauss"``.
 
     Example:
         >>> load_hyperparameters("sac_flow", "TunnelDiagonal-v0")["ent_coef"]

@@ -144,11 +144,7 @@ _FURTHER: dict[str, Check] = {
 
 
 def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check]) -> None:
-    """Check the arguments of an algorithm.
-
-    Args:
-        settings: Arguments by name.
-        table: Checks by name; arguments that it does not list are not checked.
+    """Check the arguments of an algorithm that the table, or :data:`_FURTHER`, lists.
 
     Raises:
         ValueError: If one is of another type or out of range; the message names it.
@@ -179,9 +175,6 @@ def by_name(algorithm: type, args: Iterable[Any], kwargs: Mapping[str, Any]) -> 
 def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
     """Check that a policy is one of an algorithm's names, or a class of its kind.
 
-    Raises:
-        ValueError: If the name is unknown, or the class belongs to another algorithm.
-
     Example:
         >>> from stable_baselines3.sac.policies import SACPolicy
         >>> from sb3_flowpolicy import FlowTQCPolicy
@@ -191,7 +184,6 @@ def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
         ValueError: policy must be one of ['FlowPolicy'] or a SACPolicy, got FlowTQCPolicy
     """
     known = list(names)
-    fits = issubclass(policy, base) if isinstance(policy, type) else policy in known
-    if not fits:
+    if not (issubclass(policy, base) if isinstance(policy, type) else policy in known):
         name = getattr(policy, "__name__", repr(policy))
         raise ValueError(f"policy must be one of {known} or a {base.__name__}, got {name}")

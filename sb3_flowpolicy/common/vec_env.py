@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
@@ -21,15 +20,9 @@ def make_batched_env(
 
     Args:
         env_id: Id of an environment that brings a vectorized form, as all of ``flowpolicy_envs``.
-        n_envs: Number of environments, at least 1.
+        n_envs: Number of environments.
         seed: Seed of the first; the others get those after it.
         **env_kwargs: Arguments of the environment.
-
-    Returns:
-        The environments, with SB3's record of episodes around them.
-
-    Raises:
-        gymnasium.error.Error: If the environment has no vectorized form.
 
     Example:
         >>> import flowpolicy_envs
@@ -50,24 +43,15 @@ def make_batched_env(
 
 
 class BatchedVecEnv(VecEnv):
-    """Translates gymnasium's ``VectorEnv`` to SB3's ``VecEnv``.
-
-    Args:
-        venv: Vectorized environment with array observations that resets in the same step.
-
-    Raises:
-        ValueError: If it resets at another time.
-    """
+    """Gymnasium's ``VectorEnv``, if it resets in the same step, as SB3's ``VecEnv``."""
 
     def __init__(self, venv: VectorEnv) -> None:
         mode = venv.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"venv must reset in the same step, got autoreset_mode {mode}")
         self.venv = venv
-        self._actions: np.ndarray | None = None
-        space, actions = venv.single_observation_space, venv.single_action_space
-        assert isinstance(space, spaces.Space)
-        super().__init__(venv.num_envs, space, actions)
+        observation_space: Any = venv.single_observation_space
+        super().__init__(venv.num_envs, observation_space, venv.single_action_space)
 
     def reset(self) -> np.ndarray:
         """Reset all environments and return their observations, (N, ...)."""
@@ -84,7 +68,6 @@ class BatchedVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take the step."""
-        assert self._actions is not None
         obs, rewards, terminated, truncated, batch = self.venv.step(self._actions)
         dones = terminated | truncated
         infos = []

@@ -70,9 +70,6 @@ class PolicyDiagnosticsCallback(BaseCallback):
         n_states: Number of states, at least 1.
         n_samples: Number of actions per state, at least 2.
 
-    Raises:
-        ValueError: If an argument is out of range, or the policy is not one of this package.
-
     Example:
         >>> from sb3_flowpolicy import SACFlow
         >>> model = SACFlow("FlowPolicy", "Pendulum-v1", learning_starts=50)

@@ -191,7 +191,7 @@ class CouplingFlow(ActionDistribution):
                 nn.init.zeros_(coupling.last.weight)
                 nn.init.zeros_(coupling.last.bias)
 
-    def _apply(
+    def _through(
         self, context: th.Tensor, value: th.Tensor, log_prob: th.Tensor, inverse: bool
     ) -> tuple[th.Tensor, th.Tensor]:
         """Map ``value`` through all pairs and subtract their log-determinants from ``log_prob``."""
@@ -207,10 +207,10 @@ class CouplingFlow(ActionDistribution):
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        return self._apply(context, noise, standard_normal_log_prob(noise), inverse=False)
+        return self._through(context, noise, standard_normal_log_prob(noise), inverse=False)
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
-        noise, minus_ladj = self._apply(context, value, value.new_zeros(()), inverse=True)
+        noise, minus_ladj = self._through(context, value, value.new_zeros(()), inverse=True)
         return score_standard_normal(noise) + minus_ladj
 
     def _mode(self, context: th.Tensor) -> th.Tensor:

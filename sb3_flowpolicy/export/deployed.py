@@ -19,26 +19,21 @@ class DeployedPolicy(nn.Module):
     """Map the environment's observations to actions in the environment's units.
 
     Includes what ``VecNormalize`` and ``policy.predict`` do: normalize and clip, apply the policy
-    and tanh, rescale and reshape to the action space.
-
-    Args:
-        policy: One of our policies, without gSDE.
-        normalization: Statistics of the observations, if the policy was trained with any.
-        stochastic: Whether noise is a further input, and a sampled action a further output.
+    and tanh, rescale and reshape to the action space. If ``stochastic``, noise is a further input
+    and a sampled action a further output.
     """
 
     def __init__(
         self, policy: DistributionPolicy, normalization: Normalization | None, stochastic: bool
     ) -> None:
         super().__init__()
-        assert isinstance(policy.actor, FlowActor)
-        assert isinstance(policy.action_space, spaces.Box)
         # A copy, as it is moved to the CPU and set to evaluation mode.
-        self.actor = copy.deepcopy(policy.actor)
+        self.actor: FlowActor = copy.deepcopy(policy.actor)
         self.stochastic = stochastic
         self.keys = list(parts_of(policy.observation_space))
-        self.action_shape = policy.action_space.shape
-        low, high = policy.action_space.low.reshape(-1), policy.action_space.high.reshape(-1)
+        space: Any = policy.action_space
+        self.action_shape = space.shape
+        low, high = space.low.reshape(-1), space.high.reshape(-1)
         self.register_buffer("low", th.from_numpy(low.copy()))
         self.register_buffer("span", th.from_numpy(high - low))
         self.clip = 0.0 if normalization is None else normalization.settings["clip_obs"]
@@ -58,9 +53,7 @@ class DeployedPolicy(nn.Module):
     def forward(self, *inputs: th.Tensor) -> tuple[th.Tensor, ...]:
         """Return the deterministic action (batch, ...) and, if stochastic, a sampled one.
 
-        Args:
-            *inputs: One observation (batch, ...) per key and, if stochastic, standard normal noise
-                (batch, M).
+        ``inputs`` are an observation (batch, ...) per key and, if stochastic, noise (batch, M).
         """
         obs: Any = {key: self._normalize(i, inputs[i]) for i, key in enumerate(self.keys)}
         context = self.actor.context(obs.get(ONLY_KEY, obs))

@@ -20,7 +20,7 @@ from sb3_flowpolicy.bundle.model import made_with
 from sb3_flowpolicy.bundle.normalization import normalization_of
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.export.deployed import DeployedPolicy, expected_actions, random_inputs
-from sb3_flowpolicy.policies import DistributionPolicy, FlowActor
+from sb3_flowpolicy.policies import FlowActor
 
 FORMAT = "sb3_flowpolicy.onnx.1"
 #: Largest accepted difference to ``predict``, relative to the range of the actions.
@@ -71,17 +71,13 @@ def export_onnx(
         >>> action.shape
         (5, 1)
     """
-    policy = model.policy
-    if not isinstance(policy, DistributionPolicy) or not isinstance(policy.actor, FlowActor):
-        actor = type(getattr(policy, "actor", None)).__name__
+    policy: Any = model.policy
+    actor, mode = getattr(policy, "actor", None), getattr(policy, "deterministic_mode", None)
+    if mode != "base" or not isinstance(actor, FlowActor):
         raise ValueError(
-            "model must have a policy of sb3_flowpolicy with use_sde=False, got "
-            f"{type(policy).__name__} with an actor of type {actor}"
-        )
-    if policy.deterministic_mode != "base":
-        raise ValueError(
-            'deterministic_mode must be "base" for an ONNX file, which holds no candidates to '
-            f"choose from, got {policy.deterministic_mode!r}"
+            'model must have a policy of sb3_flowpolicy with deterministic_mode="base" and '
+            f"use_sde=False, got {type(policy).__name__} with deterministic_mode={mode!r} and an "
+            f"actor of type {type(actor).__name__}"
         )
     normalization = normalization_of(model, vec_normalize)
     deployed = DeployedPolicy(policy, normalization, stochastic).cpu().eval()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,6 +14,10 @@ from torch import nn
 
 from sb3_flowpolicy.policies.actor import FlowActor
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
+
+_BATCH_NORM_ARGUMENTS = (
+    *("batch_norm", "batch_norm_momentum", "batch_norm_eps", "renorm_warmup_steps"),
+)
 
 
 class CrossQFlowActor(FlowActor):
@@ -26,20 +31,10 @@ class CrossQFlowActor(FlowActor):
 
     set_bn_training_mode = StockCrossQActor.set_bn_training_mode
 
-    def __init__(
-        self,
-        *args: Any,
-        batch_norm: bool = True,
-        batch_norm_momentum: float = 0.01,
-        batch_norm_eps: float = 0.001,
-        renorm_warmup_steps: int = 100_000,
-        **kwargs: Any,
-    ) -> None:
-        self._batch_norm: dict[str, Any] = {
-            "batch_norm": batch_norm,
-            "batch_norm_momentum": batch_norm_momentum,
-            "batch_norm_eps": batch_norm_eps,
-            "renorm_warmup_steps": renorm_warmup_steps,
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        parameters = inspect.signature(StockCrossQActor).parameters
+        self._batch_norm = {
+            name: kwargs.pop(name, parameters[name].default) for name in _BATCH_NORM_ARGUMENTS
         }
         super().__init__(*args, **kwargs)
 

@@ -1,20 +1,15 @@
 """`python -m sb3_flowpolicy.zoo.evaluate`: success rate and picture of a trained model."""
 
-import argparse
 from pathlib import Path
 
 from sb3_flowpolicy.diagnostics import evaluate_success, rollout_figure
-from sb3_flowpolicy.zoo.saved_run import add_run_arguments, load_run
+from sb3_flowpolicy.zoo.saved_run import load_run, run_parser
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_flowpolicy.zoo.evaluate",
-        description="Print the success rate of a trained model and draw its policy.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    add_run_arguments(parser)
+    description = "Print the success rate of a trained model and draw its policy."
+    parser = run_parser("evaluate", description)
     add = parser.add_argument
     add("-n", "--n-episodes", type=int, default=100, help="episodes per success rate")
     add("-o", "--output", type=Path, help="picture (default: policy.png next to the model)")

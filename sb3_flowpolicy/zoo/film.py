@@ -1,21 +1,18 @@
 """`python -m sb3_flowpolicy.zoo.film`: video and picture sequence of a trained model."""
 
-import argparse
 from pathlib import Path
 
 from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
-from sb3_flowpolicy.zoo.saved_run import add_run_arguments, load_run
+from sb3_flowpolicy.zoo.saved_run import load_run, run_parser
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_flowpolicy.zoo.film",
-        description="Write an MP4 of a trained model with its action samples drawn as dots, and "
-        "optionally a picture of consecutive steps. Works for all environments of this package.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    parser = run_parser(
+        "film",
+        "Write an MP4 of a trained model with its action samples drawn as dots, and optionally a "
+        "picture of consecutive steps. Works for all environments of this package.",
     )
-    add_run_arguments(parser)
     add = parser.add_argument
     add("-n", "--n-episodes", type=int, default=1, help="episodes in the video")
     add("--n-samples", type=int, default=300, help="action samples drawn at each step")

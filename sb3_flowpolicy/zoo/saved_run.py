@@ -9,8 +9,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_flowpolicy.zoo.registration import ALGORITHMS, register
 
 
-def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that select a run, named as in `rl_zoo3.enjoy`."""
+def run_parser(command: str, description: str) -> argparse.ArgumentParser:
+    """Return a parser with the options that select a run, named as in `rl_zoo3.enjoy`."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m sb3_flowpolicy.zoo.{command}",
+        description=description,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     add = parser.add_argument
     add("--algo", default="sac_flow", choices=ALGORITHMS, help="algorithm")
     add("--env", default="TunnelDiagonal-v0", help="environment id")
@@ -19,10 +24,11 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     add("--load-best", action="store_true", help="take the best model, not the last")
     add("--model", type=Path, help="a model's zip file, instead of a run of rl_zoo3")
     add("--seed", type=int, default=0, help="seed of the episodes")
+    return parser
 
 
 def load_run(args: argparse.Namespace) -> tuple[BaseAlgorithm, VecEnv, Path]:
-    """Load the run that the options of `add_run_arguments` select.
+    """Load the run that the options of `run_parser` select.
 
     Returns:
         The model, one environment that renders `rgb_array`, and the model's file.

@@ -79,7 +79,10 @@ def test_where_statistics_are_looked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["safe", "nowhere.zip"], "No such file or directory: 'nowhere.zip'"),
+        (
+            ["safe", "nowhere.zip"],
+            "nowhere.zip must be a bundle written by save_safe: not a regular file that",
+        ),
         (["safe", "text.zip"], "text.zip must be a bundle written by save_safe: a header of"),
         (["onnx", "empty.zip"], "empty.zip must be a model that SACFlow or SAC saved, got "),
         (["onnx", "stock.zip"], "model must have a policy of sb3_flowpolicy"),

@@ -174,14 +174,12 @@ def test_the_model_is_left_as_it_was(tmp_path: Path) -> None:
 
 def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     choosy = SACFlow("FlowPolicy", "Pendulum-v1", policy_kwargs={"deterministic_mode": "q"})
-    with pytest.raises(ValueError, match='deterministic_mode must be "base" for an ONNX file'):
+    with pytest.raises(ValueError, match="got FlowPolicy with deterministic_mode='q'"):
         export_onnx(choosy, tmp_path / "choosy")
     with pytest.raises(ValueError, match="use_sde=False, got SACPolicy"):
         export_onnx(SAC("MlpPolicy", "Pendulum-v1", **FAST), tmp_path / "x")
     sde = SACFlow("GaussPolicy", "Pendulum-v1", use_sde=True, **FAST)
-    with pytest.raises(
-        ValueError, match="use_sde=False, got GaussPolicy with an actor of type Act"
-    ):
+    with pytest.raises(ValueError, match=r"use_sde=False, got GaussPolicy .* an actor of type Act"):
         export_onnx(sde, tmp_path / "x")
     named = spaces.Dict({"noise": spaces.Box(-1, 1, (4,))})
     model = SACFlow("MultiInputGaussPolicy", Robot(named), policy_kwargs=NET, **FAST)
