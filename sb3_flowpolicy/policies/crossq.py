@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from functools import partial
 from typing import Any, ClassVar
 
@@ -15,15 +14,18 @@ from torch import nn
 from sb3_flowpolicy.policies.actor import FlowActor
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
-_BATCH_NORM_ARGUMENTS = (
-    *("batch_norm", "batch_norm_momentum", "batch_norm_eps", "renorm_warmup_steps"),
-)
+_BATCH_NORM = {
+    "batch_norm": True,
+    "batch_norm_momentum": 0.01,
+    "batch_norm_eps": 0.001,
+    "renorm_warmup_steps": 100_000,
+}
 
 
 class CrossQFlowActor(FlowActor):
     """:class:`FlowActor` with CrossQ's batch renormalization before and after each hidden layer.
 
-    The further arguments are those of sb3-contrib's actor.
+    The further arguments, ``batch_norm``, ..., are those of sb3-contrib's actor.
 
     References:
         CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).
@@ -32,9 +34,8 @@ class CrossQFlowActor(FlowActor):
     set_bn_training_mode = StockCrossQActor.set_bn_training_mode
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        parameters = inspect.signature(StockCrossQActor).parameters
-        self._batch_norm = {
-            name: kwargs.pop(name, parameters[name].default) for name in _BATCH_NORM_ARGUMENTS
+        self._batch_norm: dict[str, Any] = {
+            name: kwargs.pop(name, default) for name, default in _BATCH_NORM.items()
         }
         super().__init__(*args, **kwargs)
 
