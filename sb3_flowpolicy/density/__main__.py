@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 import time
@@ -35,13 +34,12 @@ def main(arguments: list[str] | None = None) -> None:
     if args.action == "list":
         for study in STUDIES.values():
             print(f"{study.name} ({study.claim}): {study.title}")
-            print(f"  models: {', '.join(study.recipes)}")
+            print(f"  models: {', '.join(study.epochs)}")
             print(f"  thesis: {study.thesis}\n  criteria: {study.rules}\n")
         return
     try:
         if args.action == "report":
-            origin = args.out / "origin.txt"
-            print(write_report(args.out, origin.read_text() if origin.exists() else ""))
+            print(write_report(args.out))
             return
         begin, commit = time.monotonic(), machine()["commit"] or "unknown (no source tree)"
         run_studies(
@@ -52,10 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
             args.jobs,
             progress=not args.no_progress,
         )
-        used = os.times()
-        cpu = used.user + used.system + used.children_user + used.children_system
-        wall = time.monotonic() - begin
-        took = f"{wall / 60:.1f} minutes ({cpu / 60:.1f} minutes of processor time)"
+        took = f"{(time.monotonic() - begin) / 60:.1f} minutes"
         given = sys.argv[1:] if arguments is None else arguments
         command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
         write_text(args.out / "origin.txt", f"Made by `{command}` at commit {commit}, in {took}.")
@@ -84,12 +79,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-progress", action="store_true", help="no progress bars")
     report = actions.add_parser("report", help="write README.md next to the results, and print it")
     for sub in (run, report):
-        sub.add_argument(
-            "--out",
-            type=Path,
-            default=DEFAULT_FOLDER,
-            help=f"folder of the results (default: {DEFAULT_FOLDER})",
-        )
+        folder = f"folder of the results (default: {DEFAULT_FOLDER})"
+        sub.add_argument("--out", type=Path, default=DEFAULT_FOLDER, help=folder)
     return parser
 
 

@@ -94,7 +94,7 @@ def test_turning_points_and_angle_changes_nothing() -> None:
     condition = angle_condition(np.full(20, turn))
     np.testing.assert_allclose(
         AngleMoons().log_density(Sample(points @ matrix, condition)),
-        moon_log_density(points, NOISE),
+        moon_log_density(points),
     )
 
 
@@ -105,7 +105,7 @@ def test_moon_density_converged_in_its_nodes() -> None:
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     distance = ((points[:, None] - arc) ** 2).sum(-1)
     density = np.exp(-distance / (2 * NOISE**2)).mean(1) / (2 * np.pi * NOISE**2)
-    ours = np.exp(moon_log_density(points, NOISE))
+    ours = np.exp(moon_log_density(points))
     np.testing.assert_allclose(ours, density, rtol=1e-5, atol=1e-9)
 
 
@@ -134,5 +134,3 @@ def test_entropy_of_a_box_that_misses_mass_is_refused() -> None:
 def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match=r"n must be a multiple of 22 angles, got 100"):
         AngleMoons().draw(100, seed=0)
-    with pytest.raises(ValueError, match=r"noise must be at least 0\.04, got 0\.01"):
-        moon_log_density(np.zeros((1, 2)), noise=0.01)
