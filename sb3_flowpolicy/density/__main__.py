@@ -19,7 +19,26 @@ DEFAULT_FOLDER = Path("density_results")
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    parser = _parser()
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.density",
+        description="Fit small normalizing flows to data in the plane, as in chapter 2.1 of the "
+        "thesis, and compare their held-out likelihood with the exact entropy of the data.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", required=True, metavar="list|run|report")
+    actions.add_parser("list", help="show the studies, the thesis's findings and the criteria")
+    run = actions.add_parser("run", help="fit, measure and draw; tables and pictures go to --out")
+    add = run.add_argument
+    add("names", nargs="*", metavar="NAME", help="studies (default: all)")
+    add("--seeds", type=int, default=10, help="number of seeds (default: 10)")
+    add("--first-seed", type=int, default=0, help="first seed (default: 0)")
+    add("--quick", action="store_true", help="two seeds, hardly trained, within a minute")
+    add("--jobs", type=int, default=1, help="models fitted at the same time (default: 1)")
+    report = actions.add_parser("report", help="write README.md next to the results, and print it")
+    for sub in (run, report):
+        folder = f"folder of the results (default: {DEFAULT_FOLDER})"
+        sub.add_argument("--out", type=Path, default=DEFAULT_FOLDER, help=folder)
     args = parser.parse_args(arguments)
     # Slow imports that --help does not need.
     try:
@@ -48,7 +67,6 @@ def main(arguments: list[str] | None = None) -> None:
             QUICK if args.quick else FULL,
             args.out,
             args.jobs,
-            progress=not args.no_progress,
         )
         took = f"{(time.monotonic() - begin) / 60:.1f} minutes"
         given = sys.argv[1:] if arguments is None else arguments
@@ -57,31 +75,6 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
     except (ValueError, OSError) as error:
         parser.error(str(error))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_flowpolicy.density",
-        description="Fit small normalizing flows to data in the plane, as in chapter 2.1 of the "
-        "thesis, and compare their held-out likelihood with the exact entropy of the data.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="list|run|report")
-    actions.add_parser("list", help="show the studies, the thesis's findings and the criteria")
-    run = actions.add_parser("run", help="fit, measure and draw; tables and pictures go to --out")
-    add = run.add_argument
-    add("names", nargs="*", metavar="NAME", help="studies (default: all)")
-    add("--seeds", type=int, default=10, help="number of seeds (default: 10)")
-    add("--first-seed", type=int, default=0, help="first seed (default: 0)")
-    add("--quick", action="store_true", help="two seeds, hardly trained, within a minute")
-    add("--jobs", type=int, default=1, help="models fitted at the same time (default: 1)")
-    add("--no-progress", action="store_true", help="no progress bars")
-    report = actions.add_parser("report", help="write README.md next to the results, and print it")
-    for sub in (run, report):
-        folder = f"folder of the results (default: {DEFAULT_FOLDER})"
-        sub.add_argument("--out", type=Path, default=DEFAULT_FOLDER, help=folder)
-    return parser
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -37,11 +36,6 @@ class Scaler(NamedTuple):
     mean: np.ndarray
     scale: np.ndarray
 
-    @classmethod
-    def of(cls, points: np.ndarray) -> Scaler:
-        """Measure mean and standard deviation of points (N, 2), like scikit-learn's scaler."""
-        return cls(points.mean(0), points.std(0))
-
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Standardize points (..., 2)."""
         return (points - self.mean) / self.scale
@@ -52,32 +46,7 @@ class Scaler(NamedTuple):
         return float(np.log(self.scale).sum())
 
 
-class DataSet(ABC):
-    """A distribution over points in the plane, possibly given a condition of C numbers."""
-
-    n_train: int
-    condition_dim: int
-    # Whether models are fitted to standardized points.
-    standardized: bool
-
-    @abstractmethod
-    def draw(self, n: int, seed: int) -> Sample:
-        """Draw n points in random order."""
-
-    @abstractmethod
-    def log_density(self, sample: Sample) -> np.ndarray:
-        """Return log p(x | condition) of the true density in nats, shape (N,)."""
-
-    @abstractmethod
-    def entropy(self) -> float:
-        """Return the differential entropy given the condition, in nats, before standardizing."""
-
-    def scaler(self, sample: Sample) -> Scaler:
-        """Return the scaler of a training sample: the identity unless standardized."""
-        return Scaler.of(sample.points) if self.standardized else Scaler(np.zeros(2), np.ones(2))
-
-
-class TwoMoons(DataSet):
+class TwoMoons:
     """Two interleaved half circles from scikit-learn's ``make_moons``.
 
     Args:
@@ -91,7 +60,6 @@ class TwoMoons(DataSet):
     """
 
     n_train = 2000
-    standardized = True
 
     def __init__(self, labelled: bool = False) -> None:
         self.labelled = labelled
@@ -102,8 +70,12 @@ class TwoMoons(DataSet):
         points, label = make_moons(n, noise=NOISE, random_state=seed)
         return Sample(points, label[:, None][:, : self.condition_dim].astype(float))
 
+    def scaler(self, sample: Sample) -> Scaler:
+        """Measure mean and standard deviation of a training sample."""
+        return Scaler(sample.points.mean(0), sample.points.std(0))
+
     def log_density(self, sample: Sample) -> np.ndarray:
-        """Score points under the moon of their label, or under the mixture of both moons."""
+        """Score points, in nats, under the moon of their label, or under the mixture of both."""
         upper = moon_log_density(sample.points)
         # A rotation by 180 degrees around (0.5, 0.25) maps one moon to the other.
         lower = moon_log_density(np.array([1.0, 0.5]) - sample.points)
@@ -112,7 +84,7 @@ class TwoMoons(DataSet):
         return np.logaddexp(upper, lower) - np.log(2)
 
     def entropy(self) -> float:
-        """Integrate over both moons, or over the first one, which is congruent to the other."""
+        """Return the entropy given the label, if any, in nats, before standardizing."""
         condition = np.zeros((1, self.condition_dim))
 
         def log_density(points: np.ndarray) -> np.ndarray:
@@ -121,7 +93,7 @@ class TwoMoons(DataSet):
         return entropy_on_grid(log_density, (-1.0, -0.5), (2.0, 1.0))
 
 
-class AngleMoons(DataSet):
+class AngleMoons:
     """Half circles around the origin that point in the direction of an angle.
 
     The upper half circle has angle 0; angle θ turns it by θ, counter-clockwise. The condition is
@@ -137,16 +109,14 @@ class AngleMoons(DataSet):
 
     n_train = len(TRAINING_ANGLES) * POINTS_PER_ANGLE
     condition_dim = 2
-    standardized = False
 
     def __init__(self, angles: np.ndarray = TRAINING_ANGLES) -> None:
         self.angles = np.asarray(angles, dtype=float)
 
     def draw(self, n: int, seed: int) -> Sample:
-        """Draw n points, equally many from each half circle: a multiple of their number."""
-        per_angle, rest = divmod(n, len(self.angles))
-        if rest or n < 1:
-            raise ValueError(f"n must be a multiple of {len(self.angles)} angles, got {n}")
+        """Draw at least n points, equally many from each half circle."""
+        per_angle = -(-n // len(self.angles))
+        n = per_angle * len(self.angles)
         rng = np.random.default_rng(seed)
         order = rng.permutation(n)
         turn = self.angles.repeat(per_angle)[order]
@@ -156,15 +126,22 @@ class AngleMoons(DataSet):
         points += NOISE * rng.standard_normal(points.shape)
         return Sample(points, angle_condition(turn))
 
+    def scaler(self, sample: Sample) -> Scaler:
+        """Return the identity: the half circles are centered, with radius 1."""
+        return Scaler(np.zeros(2), np.ones(2))
+
     def log_density(self, sample: Sample) -> np.ndarray:
-        """Turn every point back to angle 0 and score it there."""
+        """Score points, in nats, after turning them back to angle 0."""
         sin, cos = sample.condition.T
         x, y = sample.points.T
         return moon_log_density(np.stack([cos * x + sin * y, cos * y - sin * x], axis=1))
 
     def entropy(self) -> float:
-        """Integrate one half circle; all are congruent."""
+        """Return the entropy given the angle: that of any half circle."""
         return entropy_on_grid(moon_log_density, (-1, 0), (1, 1))
+
+
+DataSet = TwoMoons | AngleMoons
 
 
 def angle_condition(angle: np.ndarray) -> np.ndarray:

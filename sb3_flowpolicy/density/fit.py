@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch as th
 from torch.func import functional_call, stack_module_state, vmap
 from torch.optim.lr_scheduler import OneCycleLR
-from tqdm import tqdm
 
 from sb3_flowpolicy.density.models import FlowModel, make_model
 
@@ -98,7 +97,6 @@ def fit(
     epochs: int,
     seed: int = 0,
     check_every: int = 10,
-    progress: bool = False,
 ) -> Curves:
     """Train an ensemble and keep the weights with the best validation of each seed.
 
@@ -109,7 +107,6 @@ def fit(
         epochs: Passes over the training sample.
         seed: Seed of the order of the points.
         check_every: Epochs between two evaluations of the validation sample.
-        progress: Whether to show a progress bar.
 
     References:
         Noise Regularization for Conditional Density Estimation (Rothfuss et al., 2019);
@@ -125,8 +122,7 @@ def fit(
     best_nll, best_epoch = th.full((n_seeds,), th.inf), th.zeros(n_seeds, dtype=th.long)
     rows: list[tuple[int, th.Tensor, th.Tensor]] = []
 
-    bar = tqdm(range(1, epochs + 1), desc=ensemble.name, unit="epoch", disable=not progress)
-    for epoch in bar:
+    for epoch in range(1, epochs + 1):
         keys = th.rand(n_seeds, n_points, generator=generator)
         for batch in keys.argsort(dim=1).chunk(BATCHES_PER_EPOCH, dim=1):
             each = th.arange(n_seeds)[:, None]
@@ -149,7 +145,6 @@ def fit(
         best_nll, best_epoch = th.where(better, nll, best_nll), best_epoch.where(~better, epoch)
         for name, value in best.items():
             value[better] = average[name][better]
-        bar.set_postfix_str(f"validation {best_nll.mean():.3f} nats")
     ensemble.weights = best
     checked, train_nll, validation_nll = zip(*rows, strict=True)
     return Curves(th.tensor(checked), th.stack(train_nll), th.stack(validation_nll), best_epoch)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.density.datasets import AngleMoons, DataSet, Sample, Scaler
+from sb3_flowpolicy.density.datasets import AngleMoons, Sample, Scaler
 from sb3_flowpolicy.density.fit import Curves, Data, Ensemble, fit, mean_nll
 from sb3_flowpolicy.density.models import FlowModel
 from sb3_flowpolicy.density.studies import STUDIES, Scale, angles_to_score
@@ -46,28 +46,19 @@ class Fitted:
         return self.ensemble.member(self.middle)
 
 
-def fit_and_measure(
-    study_name: str, model: str, seeds: Sequence[int], scale: Scale, progress: bool = False
-) -> Fitted:
+def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Scale) -> Fitted:
     """Draw each seed's data, train its copy of a model, and score it on held-out data."""
     study = STUDIES[study_name]
     data = study.data()
     train = [data.draw(data.n_train, seed) for seed in seeds]
     scalers = [data.scaler(sample) for sample in train]
-    others = _round_up(scale.n_validation, data), _round_up(scale.n_heldout, data)
-    validation = [data.draw(others[0], VALIDATION_SEED + seed) for seed in seeds]
-    heldout = [data.draw(others[1], HELDOUT_SEED + seed) for seed in seeds]
+    validation = [data.draw(scale.n_validation, VALIDATION_SEED + seed) for seed in seeds]
+    heldout = [data.draw(scale.n_heldout, HELDOUT_SEED + seed) for seed in seeds]
 
     ensemble = Ensemble(model, data.condition_dim, seeds)
     train_data, held = as_data(train, scalers), as_data(heldout, scalers)
-    curves = fit(
-        ensemble,
-        train_data,
-        as_data(validation, scalers),
-        max(2, study.epochs[model] // scale.shrink),
-        seed=min(seeds),
-        progress=progress,
-    )
+    epochs = max(2, study.epochs[model] // scale.shrink)
+    curves = fit(ensemble, train_data, as_data(validation, scalers), epochs, seed=min(seeds))
     train_nll = mean_nll(ensemble, train_data)
     with th.no_grad():
         log_q = ensemble.log_prob(held.points, held.condition).double().numpy()
@@ -172,9 +163,3 @@ def _angle_rows(ensemble: Ensemble, scale: Scale) -> list[Row]:
 
 def _standard_error(values: np.ndarray) -> float:
     return float(values.std(ddof=1) / math.sqrt(len(values)))
-
-
-def _round_up(n: int, data: DataSet) -> int:
-    """Round up to the next multiple of the number of angles or moons."""
-    n_groups = len(data.angles) if isinstance(data, AngleMoons) else 2
-    return -(-n // n_groups) * n_groups

@@ -121,20 +121,17 @@ class ZukoNAF(ZukoModel):
         super().__init__(
             "NAF", condition_dim, transforms=LAYERS, hidden_features=HIDDEN, network=network
         )
-        for module in self.flow.modules():
-            if isinstance(module, import_module("zuko").flows.neural.MNN):
-                self._start_near_identity(module.network[0], module.network[-1])
-
-    @staticmethod
-    @th.no_grad()
-    def _start_near_identity(first: Any, last: Any) -> None:
-        """Set the weights of a monotone network, which uses their absolute values."""
-        # The inputs are the coordinate and 16 signals from the other coordinates.
-        first.weight[..., :1].uniform_(0.5, 2.0)
-        first.weight[..., 1:].uniform_(0.0, 1.0)
-        first.bias.uniform_(-2.0, 2.0)
-        last.weight.abs_().div_(last.weight.sum(-1, keepdim=True))
-        last.bias.zero_()
+        with th.no_grad():
+            for module in self.flow.modules():
+                if isinstance(module, import_module("zuko").flows.neural.MNN):
+                    # The networks use the absolute values of their weights. Their inputs are the
+                    # coordinate and 16 signals from the other coordinates.
+                    first, last = module.network[0], module.network[-1]
+                    first.weight[..., :1].uniform_(0.5, 2.0)
+                    first.weight[..., 1:].uniform_(0.0, 1.0)
+                    first.bias.uniform_(-2.0, 2.0)
+                    last.weight.abs_().div_(last.weight.sum(-1, keepdim=True))
+                    last.bias.zero_()
 
 
 # Name -> (condition_dim -> model). Sizes are the thesis's. The spline flow is not in the thesis; it

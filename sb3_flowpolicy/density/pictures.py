@@ -22,27 +22,16 @@ from sb3_flowpolicy.density.datasets import (
     TwoMoons,
     angle_condition,
 )
-from sb3_flowpolicy.density.figures import (
-    BLUE,
-    GREY,
-    ORANGE,
-    PICTURE_SEED,
-    density_picture,
-    draw_density,
-    draw_points,
-    grid_of_panels,
-    picture_noise,
-    pixel_centers,
-    sample,
-    save,
-)
-from sb3_flowpolicy.density.measure import Fitted, label_posterior
+from sb3_flowpolicy.density.measure import CHUNK, Fitted, label_posterior
 from sb3_flowpolicy.density.models import FlowModel, OurRealNVP
 from sb3_flowpolicy.density.studies import Scale
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Seed of the noise and of the new points.
+PICTURE_SEED = 7
+BLUE, ORANGE, GREY = "#1f6fb4", "#d9662b", "#555555"
 # Model -> its label and its color.
 STYLES = {
     "realnvp": ("RealNVP (ours)", BLUE),
@@ -62,27 +51,27 @@ AROUND = np.arange(8) * np.pi / 4
 def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw curves (2.3), samples (2.4), densities (2.5) and layers (2.1)."""
     ours = fits[0]
-    save(_curves_figure(fits, ours.rows[0]["entropy"]), folder / "two-moons-curves.png")
+    _save(_curves_figure(fits, ours.rows[0]["entropy"]), folder / "two-moons-curves.png")
 
     data, scaler = TwoMoons(), ours.scalers[ours.middle]
     points = scaler.apply(data.draw(data.n_train, ours.ensemble.seeds[ours.middle]).points)
-    plane = pixel_centers(MOONS_EXTENT, scale.pixels).numpy().astype(float)
+    plane = _pixel_centers(MOONS_EXTENT, scale.pixels).numpy().astype(float)
     raw = Sample(plane * scaler.scale + scaler.mean, np.zeros((len(plane), 0)))
     truth = np.exp(data.log_density(raw) + scaler.log_volume).reshape(scale.pixels, scale.pixels)
     for kind in ("samples", "density"):
-        figure, panels = grid_of_panels(len(fits) + 2, 4)
-        draw_density(panels[0], truth, MOONS_EXTENT, "true density")
-        draw_points(panels[1], points, MOONS_EXTENT, "training data", GREY)
+        figure, panels = _grid_of_panels(len(fits) + 2, 4)
+        _draw_density(panels[0], truth, MOONS_EXTENT, "true density")
+        _draw_points(panels[1], points, MOONS_EXTENT, "training data", GREY)
         for axes, fitted in zip(panels[2:], fits, strict=True):
             model, label = fitted.middle_model(), STYLES[fitted.model][0]
             if kind == "samples":
-                samples = sample(model, np.zeros((data.n_train, 0)))
-                draw_points(axes, samples, MOONS_EXTENT, label)
+                samples = _sample(model, np.zeros((data.n_train, 0)))
+                _draw_points(axes, samples, MOONS_EXTENT, label)
             else:
                 density = density_picture(model, np.zeros(0), MOONS_EXTENT, scale.pixels)
-                draw_density(axes, density, MOONS_EXTENT, label)
-        save(figure, folder / f"two-moons-{kind}.png")
-    save(_layers_figure(ours.middle_model()), folder / "two-moons-layers.png")
+                _draw_density(axes, density, MOONS_EXTENT, label)
+        _save(figure, folder / f"two-moons-{kind}.png")
+    _save(_layers_figure(ours.middle_model()), folder / "two-moons-layers.png")
 
 
 def _curves_figure(fits: Sequence[Fitted], limit: float) -> Figure:
@@ -116,12 +105,12 @@ def _curves_figure(fits: Sequence[Fitted], limit: float) -> Figure:
 def _layers_figure(model: FlowModel) -> Figure:
     """Draw the base samples after each layer, colored by their quadrant."""
     assert isinstance(model, OurRealNVP)
-    noise = picture_noise(4000)
+    noise = _picture_noise(4000)
     images = [image.numpy() for image in model.after_each_layer(noise, th.zeros(4000, 0))]
     # One color per quadrant: lower left, upper left, lower right, upper right.
     right, up = (noise.numpy() >= 0).T
     colors = np.array(["#2e8b57", "#e0a030", "#2f6db5", "#c0392b"])[2 * right + up]
-    figure, panels = grid_of_panels(len(images), 3)
+    figure, panels = _grid_of_panels(len(images), 3)
     for index, (axes, points) in enumerate(zip(panels, images, strict=True)):
         # Layers in between may shift and stretch all points: zoom each panel to its points.
         x, y = points.mean(0)
@@ -140,13 +129,13 @@ def draw_label(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     scaler = fitted.scalers[fitted.middle]
     train = data.draw(data.n_train, fitted.ensemble.seeds[fitted.middle])
     colors = np.where(train.condition[:, 0] > 0.5, ORANGE, BLUE)
-    figure, panels = grid_of_panels(3, 3, size=2.8)
-    draw_points(panels[0], scaler.apply(train.points), MOONS_EXTENT, "training data", colors)
-    samples = sample(model, train.condition)
-    draw_points(panels[1], samples, MOONS_EXTENT, "RealNVP, given the label", colors)
+    figure, panels = _grid_of_panels(3, 3, size=2.8)
+    _draw_points(panels[0], scaler.apply(train.points), MOONS_EXTENT, "training data", colors)
+    samples = _sample(model, train.condition)
+    _draw_points(panels[1], samples, MOONS_EXTENT, "RealNVP, given the label", colors)
 
     axes = panels[2]
-    posterior = label_posterior(model, pixel_centers(MOONS_EXTENT, scale.pixels))
+    posterior = label_posterior(model, _pixel_centers(MOONS_EXTENT, scale.pixels))
     axes.imshow(
         posterior.reshape(scale.pixels, scale.pixels).numpy(),
         origin="lower",
@@ -159,40 +148,40 @@ def draw_label(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     x, second = scaler.apply(fresh.points), fresh.condition[:, 0] > 0.5
     wrong = (label_posterior(model, th.from_numpy(x).float()).numpy() > 0.5) != second
     title = f"more likely label; {wrong.sum()} of {len(x)} new points wrong"
-    draw_points(axes, x, MOONS_EXTENT, title, np.where(second, ORANGE, BLUE))
+    _draw_points(axes, x, MOONS_EXTENT, title, np.where(second, ORANGE, BLUE))
     axes.scatter(x[wrong, 0], x[wrong, 1], s=30, facecolors="none", edgecolors="black")
-    save(figure, folder / "label-samples.png")
+    _save(figure, folder / "label-samples.png")
 
 
 def draw_angles(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw likelihood over the angle, samples (2.8), and densities (2.9, 2.10)."""
     (fitted,) = fits
-    save(_angle_nll_figure(fitted), folder / "angles-likelihood.png")
+    _save(_angle_nll_figure(fitted), folder / "angles-likelihood.png")
 
     data, model = AngleMoons(), fitted.middle_model()
     train = data.draw(data.n_train, fitted.ensemble.seeds[fitted.middle])
     color = np.arctan2(train.condition[:, 0], train.condition[:, 1])
-    samples = sample(model, train.condition)
-    figure, panels = grid_of_panels(2, 2, size=2.8)
-    draw_points(panels[0], train.points, ANGLES_EXTENT, "training data, 22 angles", color)
-    draw_points(panels[1], samples, ANGLES_EXTENT, "RealNVP, given the angle", color)
-    save(figure, folder / "angles-samples.png")
+    samples = _sample(model, train.condition)
+    figure, panels = _grid_of_panels(2, 2, size=2.8)
+    _draw_points(panels[0], train.points, ANGLES_EXTENT, "training data, 22 angles", color)
+    _draw_points(panels[1], samples, ANGLES_EXTENT, "RealNVP, given the angle", color)
+    _save(figure, folder / "angles-samples.png")
 
     for name, angles in (("between", BETWEEN), ("outside", AROUND)):
-        figure, panels = grid_of_panels(8, 4)
+        figure, panels = _grid_of_panels(8, 4)
         for axes, angle in zip(panels, angles, strict=True):
             kind = "between" if angle < TRAINING_ANGLES[-1] else "outside"
             if np.abs(TRAINING_ANGLES - angle).min() < 1e-6:
                 kind = "trained"
             _draw_angle(axes, model, angle, scale.pixels, f"{angle:.2f} rad, {kind}")
-        save(figure, folder / f"angles-{name}.png")
+        _save(figure, folder / f"angles-{name}.png")
     _animate(model, folder / "angles.gif", scale)
 
 
 def _draw_angle(axes: Axes, model: FlowModel, angle: float, pixels: int, title: str) -> None:
     """Draw the density given an angle, and mark both tips of the true half circle."""
     density = density_picture(model, angle_condition(np.asarray(angle)), ANGLES_EXTENT, pixels)
-    draw_density(axes, density, ANGLES_EXTENT, title)
+    _draw_density(axes, density, ANGLES_EXTENT, title)
     tips = np.array([angle, angle + np.pi])
     axes.plot(np.cos(tips), np.sin(tips), "+", color="#7fd4ff", markersize=5, markeredgewidth=0.8)
 
@@ -228,7 +217,7 @@ def _animate(model: FlowModel, path: Path, scale: Scale) -> None:
     """Turn the condition by a full circle; the title says whether the angle was trained."""
     frames = []
     for angle in np.linspace(0, 2 * np.pi, scale.frames, endpoint=False):
-        figure, (axes,) = grid_of_panels(1, 1, size=2.4)
+        figure, (axes,) = _grid_of_panels(1, 1, size=2.4)
         inside = angle <= TRAINING_ANGLES[-1]
         state = "within the trained range" if inside else "never trained"
         _draw_angle(axes, model, angle, scale.pixels // 2, f"{angle:.1f} rad, {state}")
@@ -241,6 +230,75 @@ def _animate(model: FlowModel, path: Path, scale: Scale) -> None:
         frames[0].save(
             draft, format="gif", save_all=True, append_images=frames[1:], duration=120, loop=0
         )
+
+
+def _grid_of_panels(n_panels: int, n_columns: int, size: float = 2.1) -> tuple[Figure, list[Axes]]:
+    """Return a figure of square panels without ticks, filled row by row."""
+    n_rows = -(-n_panels // n_columns)
+    figure = Figure(figsize=(size * n_columns, (size + 0.25) * n_rows), layout="constrained")
+    panels = [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_panels)]
+    for axes in panels:
+        axes.set(xticks=[], yticks=[], aspect="equal")
+    return figure, panels
+
+
+def _draw_points(
+    axes: Axes, points: np.ndarray, extent: float, title: str, color: str | np.ndarray = BLUE
+) -> None:
+    """Scatter points (N, 2); those outside [-extent, extent] are counted in the title."""
+    outside = int((np.abs(points) > extent).any(axis=1).sum())
+    axes.scatter(points[:, 0], points[:, 1], s=2.0, c=color, linewidths=0, rasterized=True)
+    axes.set(xlim=(-extent, extent), ylim=(-extent, extent))
+    axes.set_title(title + (f" ({outside} outside)" if outside else ""), fontsize=8)
+
+
+def _draw_density(axes: Axes, density: np.ndarray, extent: float, title: str) -> None:
+    """Draw the square root of a density as brightness, so that thin bridges stay visible.
+
+    The brightest percent of the pixels may saturate.
+    """
+    bright = np.quantile(density[density > density.max() * 1e-3], 0.99)
+    box = (-extent, extent, -extent, extent)
+    image = np.sqrt(np.minimum(density / bright, 1))
+    axes.imshow(image, origin="lower", extent=box, cmap="magma", vmin=0, vmax=1)
+    axes.set_title(title, fontsize=8)
+
+
+@th.no_grad()
+def density_picture(
+    model: FlowModel, condition: np.ndarray, extent: float, pixels: int
+) -> np.ndarray:
+    """Evaluate p(. | condition) at the pixel centers of a square, from the lowest y and x up."""
+    scores = [
+        model(points, th.from_numpy(condition).float().expand(len(points), -1))
+        for points in _pixel_centers(extent, pixels).split(CHUNK)
+    ]
+    return th.cat(scores).exp().reshape(pixels, pixels).numpy()
+
+
+def _pixel_centers(extent: float, pixels: int) -> th.Tensor:
+    """Return the centers of the pixels of a square, row by row from the lowest: (pixels², 2)."""
+    center = ((th.arange(pixels) + 0.5) / pixels * 2 - 1) * extent
+    return th.cartesian_prod(center, center).flip(-1)
+
+
+def _picture_noise(n: int) -> th.Tensor:
+    """Return the same standard normal noise (n, 2) for every picture."""
+    return th.randn(n, 2, generator=th.Generator().manual_seed(PICTURE_SEED))
+
+
+@th.no_grad()
+def _sample(model: FlowModel, condition: np.ndarray) -> np.ndarray:
+    """Draw one point per condition: (N, C) -> (N, 2)."""
+    return model.sample(_picture_noise(len(condition)), th.from_numpy(condition).float()).numpy()
+
+
+def _save(figure: Figure, path: Path) -> None:
+    """Write a PNG of 128 colors, about half the size of a full-color one."""
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=110, format="png")
+        image = Image.open(draft).convert("RGB").quantize(128)
+        image.save(draft, format="png", optimize=True)
 
 
 # Study -> what draws its pictures.

@@ -21,12 +21,7 @@ Task = tuple[str, str]
 
 
 def run_studies(
-    names: Sequence[str],
-    seeds: Sequence[int],
-    scale: Scale,
-    folder: Path,
-    jobs: int = 1,
-    progress: bool = False,
+    names: Sequence[str], seeds: Sequence[int], scale: Scale, folder: Path, jobs: int = 1
 ) -> None:
     """Fit, measure and draw studies.
 
@@ -36,7 +31,6 @@ def run_studies(
         scale: How much to compute.
         folder: Folder of the results, created if missing.
         jobs: Models fitted at the same time, each in a process with one thread.
-        progress: Whether to show progress bars.
     """
     if not set(names) <= STUDIES.keys():
         raise ValueError(f"studies must be among {list(STUDIES)}, got {list(names)}")
@@ -49,7 +43,8 @@ def run_studies(
     tasks = [(name, model) for name in names for model in STUDIES[name].epochs]
     tasks.sort(key=lambda task: task[1] != "naf")
     done: dict[Task, Fitted] = {}
-    for (name, model), fitted in _fits(tasks, seeds, scale, jobs, progress):
+    fits_as_completed = _fits(tasks, seeds, scale, jobs)
+    for (name, model), fitted in tqdm(fits_as_completed, total=len(tasks), unit="model"):
         done[name, model] = fitted
         if all((name, other) in done for other in STUDIES[name].epochs):
             fits = [done[name, other] for other in STUDIES[name].epochs]
@@ -58,22 +53,18 @@ def run_studies(
 
 
 def _fits(
-    tasks: Sequence[Task], seeds: Sequence[int], scale: Scale, jobs: int, progress: bool
+    tasks: Sequence[Task], seeds: Sequence[int], scale: Scale, jobs: int
 ) -> Iterable[tuple[Task, Fitted]]:
     """Yield fits as they complete."""
-    if jobs == 1 or len(tasks) == 1:
+    if jobs == 1:
         for task in tasks:
-            yield task, fit_and_measure(*task, seeds, scale, progress)
+            yield task, fit_and_measure(*task, seeds, scale)
         return
     # Forked children would inherit torch's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=th.set_num_threads, initargs=(1,)
-    ) as pool:
+    with ProcessPoolExecutor(jobs, context, th.set_num_threads, (1,)) as pool:
         futures = {pool.submit(fit_and_measure, *task, seeds, scale): task for task in tasks}
-        bar = tqdm(as_completed(futures), total=len(tasks), unit="model", disable=not progress)
-        for future in bar:
-            bar.set_postfix_str("{}: {}".format(*futures[future]))
+        for future in as_completed(futures):
             yield futures[future], future.result()
 
 

@@ -18,29 +18,17 @@ from sb3_flowpolicy.density.datasets import (
 
 @dataclass(frozen=True)
 class Scale:
-    """Amount of computation.
+    """Amount of computation."""
 
-    Args:
-        n_validation: Points per seed that select the weights.
-        n_heldout: Points per seed for the reported likelihood.
-        n_per_angle: Held-out points per seed and angle.
-        angle_step: Distance in radian between the angles scored outside the trained range.
-        cells: Grid points per axis of each integral.
-        integral_angles: Number of angles, over the full circle, whose densities are integrated.
-        shrink: Divisor of the number of epochs.
-        frames: Frames of the animation.
-        pixels: Pixels per side of a density picture.
-    """
-
-    n_validation: int = 2000
-    n_heldout: int = 10_000
-    n_per_angle: int = 1000
-    angle_step: float = 0.1
-    cells: int = 700
-    integral_angles: int = 8
-    shrink: int = 1
-    frames: int = 63
-    pixels: int = 300
+    n_validation: int = 2000  # points per seed that select the weights
+    n_heldout: int = 10_000  # points per seed for the reported likelihood
+    n_per_angle: int = 1000  # held-out points per seed and angle
+    angle_step: float = 0.1  # radian between the angles scored outside the trained range
+    cells: int = 700  # grid points per axis of each integral
+    integral_angles: int = 8  # angles, over the full circle, whose densities are integrated
+    shrink: int = 1  # divisor of the number of epochs
+    frames: int = 63  # of the animation
+    pixels: int = 300  # per side of a density picture
 
 
 FULL = Scale()
@@ -50,27 +38,16 @@ QUICK = Scale(200, 500, 50, 0.4, cells=100, integral_angles=2, shrink=50, frames
 
 @dataclass(frozen=True)
 class Study:
-    """An experiment of the chapter.
-
-    Args:
-        name: Name on the command line.
-        claim: Number among the thesis's claims.
-        title: One line.
-        data: Creates the data set.
-        epochs: Model -> epochs of its training; the first model is drawn in most pictures.
-        thesis: The thesis's findings in our words.
-        rules: Criteria in words; ``report`` checks each.
-        conditions: Scale -> conditions (K, C) of the densities to integrate.
-    """
+    """An experiment of the chapter."""
 
     name: str
-    claim: str
+    claim: str  # number among the thesis's claims
     title: str
     data: Callable[[], DataSet]
-    epochs: Mapping[str, int]
-    thesis: str
-    rules: str
-    conditions: Callable[[Scale], np.ndarray]
+    epochs: Mapping[str, int]  # by model; the first model is drawn in most pictures
+    thesis: str  # the thesis's findings in our words
+    rules: str  # criteria in words; ``report`` checks each
+    conditions: Callable[[Scale], np.ndarray]  # (K, C), of the densities to integrate
 
 
 def _angles(scale: Scale) -> np.ndarray:

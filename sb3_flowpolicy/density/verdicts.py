@@ -67,27 +67,21 @@ def two_moons(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row])
     """D1: RealNVP against MAF and NAF."""
     nll = {model: interval([row["nll"] for row in own])[0] for model, own in by_model(rows).items()}
     above = {model: value - nll["realnvp"] for model, value in nll.items()}
-    found = [
-        Verdict(
-            f"RealNVP at least 0.05 nats below {label}",
-            f"{-above[model]:+.3f} nats",
-            nll["realnvp"] <= nll[model] - 0.05,
-        )
-        for model, label in (("maf", "MAF"), ("maf-random", "MAF with random orders"))
-    ]
-    return [
-        *found,
-        Verdict(
-            "NAF at most 0.05 nats above RealNVP",
-            f"{above['naf']:+.3f} nats",
-            nll["naf"] <= nll["realnvp"] + 0.05,
+    criteria = [
+        ("RealNVP at least 0.05 nats below MAF", -above["maf"], above["maf"] >= 0.05),
+        (
+            "RealNVP at least 0.05 nats below MAF with random orders",
+            -above["maf-random"],
+            above["maf-random"] >= 0.05,
         ),
-        Verdict(
+        ("NAF at most 0.05 nats above RealNVP", above["naf"], above["naf"] <= 0.05),
+        (
             "zuko's RealNVP within 0.05 nats of ours",
-            f"{above['zuko-realnvp']:+.3f} nats",
+            above["zuko-realnvp"],
             abs(above["zuko-realnvp"]) <= 0.05,
         ),
     ]
+    return [Verdict(rule, f"{seen:+.3f} nats", holds) for rule, seen, holds in criteria]
 
 
 def label(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:

@@ -20,7 +20,7 @@ Row = dict[str, object]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("density") / "results"
-    main(["run", "--quick", "--no-progress", "--out", str(out)])
+    main(["run", "--quick", "--out", str(out)])
     return out
 
 
@@ -73,7 +73,7 @@ def test_report_shows_every_study_and_check(
 @pytest.mark.slow  # each process imports everything again
 def test_several_jobs_give_the_same_numbers(folder: Path, tmp_path: Path) -> None:
     names = ["two-moons-label", "angle-moons"]
-    main(["run", *names, "--quick", "--no-progress", "--jobs", "2", "--out", str(tmp_path)])
+    main(["run", *names, "--quick", "--jobs", "2", "--out", str(tmp_path)])
     for name in names:
         one, two = (read_csv(path / f"{name}-fits.csv") for path in (folder, tmp_path))
         for ours, theirs in zip(one, two, strict=True):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_flowpolicy.density.figures import density_picture
 from sb3_flowpolicy.density.fit import Data, Ensemble, fit, mean_nll
 from sb3_flowpolicy.density.measure import integral
 from sb3_flowpolicy.density.models import (
@@ -21,6 +20,7 @@ from sb3_flowpolicy.density.models import (
     ZukoNAF,
     make_model,
 )
+from sb3_flowpolicy.density.pictures import density_picture
 
 SEEDS = [0, 1, 2]
 
