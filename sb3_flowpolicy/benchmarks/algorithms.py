@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -27,12 +27,9 @@ from tqdm import tqdm
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.common.files import replacing
-from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
 from sb3_flowpolicy.policies import crossq, on_policy, tqc
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+# Algorithm -> its class, and the policies to compare; "stock" is the algorithm's own.
 CANDIDATES: dict[str, tuple[Any, dict[str, Any]]] = {
     "tqc": (
         TQC,
@@ -52,6 +49,7 @@ CANDIDATES: dict[str, tuple[Any, dict[str, Any]]] = {
             "flow": crossq.FlowCrossQPolicy,
         },
     ),
+    # The "-clipped" policies bound actions as SB3's PPO does, the others squash them.
     "ppo": (
         PPO,
         {
@@ -63,21 +61,6 @@ CANDIDATES: dict[str, tuple[Any, dict[str, Any]]] = {
         },
     ),
 }
-"""Algorithm -> its class, and the policies to compare."""
-
-# The "-clipped" policies bound actions as SB3's PPO does, the others squash them.
-_CLIPPED = {"squash_output": False}
-_POLICY_KWARGS = {"lowrank-clipped": _CLIPPED, "flow-clipped": _CLIPPED}
-
-# As in the figures of the experiments; "stock" is the algorithm's own policy.
-_COLORS = {
-    "stock": "#000000",
-    "gauss": "#d55e00",
-    "lowrank": "#009e73",
-    "flow": "#0072b2",
-    "lowrank-clipped": "#8fd3b6",
-    "flow-clipped": "#56b4e9",
-}
 
 
 @dataclass(frozen=True)
@@ -88,7 +71,6 @@ class Task:
     steps: dict[str, int]
     settings: dict[str, dict[str, Any]]
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    normalize: tuple[str, ...] = ()
 
 
 _OFF_POLICY = {"learning_starts": 1000, "buffer_size": 100_000, "batch_size": 256}
@@ -135,9 +117,9 @@ TASKS = {
                 "gae_lambda": 0.9,
                 "learning_rate": 3e-4,
                 "policy_kwargs": {"net_arch": [64, 64]},
+                "normalize": True,
             },
         },
-        normalize=("ppo",),
     ),
     **{
         f"tunnel-{count}": Task(
@@ -154,25 +136,16 @@ _N_TESTS = 6
 
 
 def train(task: Task, algorithm: str, policy: str, seed: int, n_episodes: int) -> list[list[Any]]:
-    """Train one agent and test it six times during training.
-
-    Args:
-        task: Environment and settings.
-        algorithm: Key of ``CANDIDATES``.
-        policy: Key of its policies.
-        seed: Seed of agent and environments.
-        n_episodes: Deterministic episodes per test.
-
-    Returns:
-        The last four ``COLUMNS`` of each test.
-    """
+    """Train an agent and return the last four ``COLUMNS`` of six tests of ``n_episodes`` each."""
     algorithm_class, policies = CANDIDATES[algorithm]
     settings = dict(task.settings[algorithm])
-    count = settings.pop("n_envs", 1)
-    policy_kwargs = {**settings.pop("policy_kwargs", {}), **_POLICY_KWARGS.get(policy, {})}
+    count, normalize = settings.pop("n_envs", 1), settings.pop("normalize", False)
+    policy_kwargs = dict(settings.pop("policy_kwargs", {}))
+    if policy.endswith("-clipped"):
+        policy_kwargs["squash_output"] = False
     venv = make_vec_env(task.env_id, count, seed, env_kwargs=task.env_kwargs)
     test_venv = make_vec_env(task.env_id, 1, 10**6 + seed, env_kwargs=task.env_kwargs)
-    if algorithm in task.normalize:
+    if normalize:
         venv = VecNormalize(venv, gamma=settings.get("gamma", 0.99))
         test_venv = VecNormalize(test_venv, training=False, norm_reward=False)
     settings |= {"policy_kwargs": policy_kwargs, "seed": seed, "device": "cpu"}
@@ -180,7 +153,7 @@ def train(task: Task, algorithm: str, policy: str, seed: int, n_episodes: int) -
     started, rows = time.perf_counter(), []
     for _ in range(_N_TESTS):
         model.learn(task.steps[algorithm] // _N_TESTS, reset_num_timesteps=False)
-        if algorithm in task.normalize:
+        if normalize:
             sync_envs_normalization(venv, test_venv)
         outcomes: list[bool] = []
 
@@ -210,30 +183,6 @@ def summary(rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join(lines)
 
 
-def learning_curves(rows: Sequence[Sequence[str]]) -> Figure:
-    """Draw the learning curves of a task, one panel per algorithm.
-
-    Args:
-        rows: Rows of one task. The success rate is drawn where it was measured, else the return.
-    """
-    has_success = all(row[6] for row in rows)
-    algorithms = list(dict.fromkeys(row[1] for row in rows))
-    figure = new_figure(1 + 3 * len(algorithms), 3)
-    axes = figure.subplots(1, len(algorithms), squeeze=False)[0]
-    for panel, algorithm in zip(axes, algorithms, strict=True):
-        chosen = [row for row in rows if row[1] == algorithm]
-        steps = list(dict.fromkeys(float(row[4]) for row in chosen))
-        for policy in dict.fromkeys(row[2] for row in chosen):
-            values = [float(row[6 if has_success else 5]) for row in chosen if row[2] == policy]
-            curves = np.reshape(values, (-1, len(steps)))
-            draw_seeds(panel, steps, curves, _COLORS[policy], f"{policy} ({len(curves)})")
-        panel.set(title=f"{algorithm.upper()}, {chosen[0][0]}", xlabel="steps")
-        panel.legend(frameon=False, fontsize=8)
-        panel.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylabel("success of test episodes" if has_success else "return of test episodes")
-    return figure
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train the runs that the command line names and the file lacks, and print a table."""
     parser = argparse.ArgumentParser(
@@ -246,18 +195,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("--task", choices=list(TASKS), default="pendulum")
     add("--algorithms", choices=list(CANDIDATES), nargs="+", help="default: all of the task's")
-    policies = list(dict.fromkeys(name for _, known in CANDIDATES.values() for name in known))
-    add("--policies", choices=policies, nargs="+", help="default: all that an algorithm has")
     add("--seeds", type=int, nargs="+", default=[1, 2, 3])
     add("--episodes", type=int, default=10, help="episodes per test")
     add("--csv", type=Path, default=Path("algorithms.csv"))
-    add("--figure", type=Path, help="also draw the learning curves of the file, as PNG")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
     task = TASKS[args.task]
-    unknown = sorted(set(args.algorithms or []) - set(task.steps))
-    if unknown:
-        parser.error(f"--algorithms of {args.task} must be among {[*task.steps]}, got {unknown}")
     if "Bullet" in task.env_id:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
@@ -268,7 +211,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (args.task, algorithm, policy, str(seed))
         for algorithm in args.algorithms or task.steps
         for policy in CANDIDATES[algorithm][1]
-        if policy in (args.policies or CANDIDATES[algorithm][1])
         for seed in args.seeds
     ]
     for run in tqdm([run for run in runs if run not in done], file=sys.stderr):
@@ -276,10 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows += [[*run, *(str(value) for value in row)] for row in found]
         with replacing(args.csv) as draft, draft.open("w") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
-    found = [row for row in rows[1:] if row[0] == args.task]
-    print(summary(found))
-    if args.figure is not None:
-        learning_curves(found).savefig(args.figure, dpi=100, metadata={"Software": None})
+    print(summary([row for row in rows[1:] if row[0] == args.task]))
 
 
 if __name__ == "__main__":

@@ -22,11 +22,7 @@ QUICK_START, QUICK_CHUNK = 50, 10
 
 
 def zoo_block(algorithm: str, env_id: str) -> dict[str, Any]:
-    """Return the arguments of SACFlow from the shipped hyperparameter file.
-
-    Args:
-        algorithm: ``"sac_flow"``, ``"sac_lowrank"`` or ``"sac_gauss"``.
-        env_id: Environment that the file lists.
+    """Return the arguments of SACFlow from the shipped hyperparameter file of an algorithm.
 
     Example:
         >>> zoo_block("sac_gauss", "TunnelDiagonal-v0")["policy_kwargs"]["net_arch"]

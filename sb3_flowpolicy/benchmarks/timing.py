@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -12,9 +13,6 @@ MIN_ROUNDS = 5
 
 # Does a piece of work and returns its amount in the benchmark's unit (updates, steps, ...).
 Work = Callable[[], float]
-Clock = Callable[[], float]
-# (next candidate, number of turns done, number of turns in total) -> None
-Progress = Callable[[str, int, int], None]
 
 
 class UnavailableError(Exception):
@@ -48,16 +46,8 @@ class Benchmark:
 
 @dataclass
 class Timing:
-    """Measurements of one candidate.
+    """Work per second in each round, without the warm-up; a note if the candidate cannot run."""
 
-    Args:
-        name: The candidate's name.
-        warm_up_seconds: Duration of preparation and of the first piece of work.
-        rates: Work per second, one number per round; empty if the candidate was unavailable.
-        note: Why it was unavailable.
-    """
-
-    name: str
     warm_up_seconds: float | None = None
     rates: list[float] = field(default_factory=list)
     note: str | None = None
@@ -78,59 +68,48 @@ def measure(
     benchmark: Benchmark,
     rounds: int = MIN_ROUNDS,
     turn_seconds: float = 0.5,
-    clock: Clock = time.perf_counter,
-    progress: Progress = lambda name, done, total: None,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> list[Timing]:
     """Prepare all candidates, then run them in turns (A B C, A B C, ...).
 
     Args:
         benchmark: Candidates to measure.
-        rounds: Turns per candidate, at least 5.
+        rounds: Turns per candidate.
         turn_seconds: A turn repeats its work until this much time has passed.
         clock: Returns seconds.
-        progress: Called before each turn and at the end.
 
     Returns:
         One timing per candidate, in order.
 
     Example:
         >>> counting = Candidate("counting", lambda: lambda: sum(range(9)))
-        >>> benchmark = Benchmark("counting", "numbers", [counting])
-        >>> [timing.name for timing in measure(benchmark, turn_seconds=0.001)]
-        ['counting']
+        >>> (timing,) = measure(Benchmark("counting", "numbers", [counting]), turn_seconds=0.001)
+        >>> len(timing.rates)
+        5
     """
-    if rounds < MIN_ROUNDS:
-        raise ValueError(f"rounds must be at least {MIN_ROUNDS}, got {rounds}")
-    if not turn_seconds > 0:
-        raise ValueError(f"turn_seconds must be above 0, got {turn_seconds}")
-    timings = [Timing(candidate.name) for candidate in benchmark.candidates]
-    total = (1 + rounds) * len(timings)
-    ready: list[tuple[Timing, Work]] = []
-    for done, (candidate, timing) in enumerate(zip(benchmark.candidates, timings, strict=True)):
-        progress(f"{candidate.name}: warm-up", done, total)
-        start = clock()
+    timings, ready = [], []
+    for candidate in benchmark.candidates:
+        _progress(f"{benchmark.title}: warm-up of {candidate.name}")
+        timing, start = Timing(), clock()
+        timings.append(timing)
         try:
             work = candidate.prepare()
             work()
         except UnavailableError as reason:
             timing.note = str(reason)
-            continue
-        timing.warm_up_seconds = clock() - start
-        ready.append((timing, work))
-    done = len(timings)
-    for _ in range(rounds):
+        else:
+            timing.warm_up_seconds = clock() - start
+            ready.append((timing, work))
+    for done in range(rounds):
+        _progress(f"{benchmark.title}: round {done + 1} of {rounds}")
         for timing, work in ready:
-            progress(timing.name, done, total)
-            timing.rates.append(_rate(work, turn_seconds, clock))
-            done += 1
-    progress("", total, total)
+            amount, elapsed, start = 0.0, 0.0, clock()
+            while elapsed < turn_seconds:
+                amount += work()
+                elapsed = clock() - start
+            timing.rates.append(amount / elapsed)
     return timings
 
 
-def _rate(work: Work, seconds: float, clock: Clock) -> float:
-    amount, start = 0.0, clock()
-    while True:
-        amount += work()
-        elapsed = clock() - start
-        if elapsed >= seconds:
-            return amount / elapsed
+def _progress(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

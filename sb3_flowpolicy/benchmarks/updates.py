@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -33,8 +32,7 @@ N_TRANSITIONS = 10_000
 MIN_UNITS_BFLOAT16 = 128
 
 
-@dataclass(frozen=True)
-class Shape:
+class Shape(NamedTuple):
     """Sizes of a problem and of the networks that solve it."""
 
     units: int
@@ -97,17 +95,16 @@ def _single_seed(shape: Shape, policies: Sequence[str]) -> Benchmark:
         return products_alone([model(SACFlow, policy, policy).policy], BATCH_SIZE, N_UPDATES)
 
     stock = updates(SAC, "MlpPolicy", "MlpPolicy")
-    candidates = [Candidate("SB3 SAC", stock, limit=_limit_name("GaussPolicy"))]
+    candidates = [Candidate("SB3 SAC", stock, _limit_name("GaussPolicy"))]
     for policy in policies:
         ours = updates(SACFlow, policy, policy, compile=True)
-        candidates.append(Candidate(f"SACFlow {policy}", ours, limit=_limit_name(policy)))
+        candidates.append(Candidate(f"SACFlow {policy}", ours, _limit_name(policy)))
         if shape.units >= MIN_UNITS_BFLOAT16 and policy != "LowRankPolicy":
             rounded = updates(SACFlow, policy, policy, compile=True, autocast=True)
             candidates.append(Candidate(f"SACFlow {policy}, bfloat16", rounded))
     if "FlowPolicy" in policies:
-        stock_with_flow = updates(SAC, FlowPolicy, "FlowPolicy")
-        name, limit_name = "SB3 SAC with FlowPolicy", _limit_name("FlowPolicy")
-        candidates.append(Candidate(name, stock_with_flow, limit=limit_name))
+        ours = updates(SAC, FlowPolicy, "FlowPolicy")
+        candidates.append(Candidate("SB3 SAC with FlowPolicy", ours, _limit_name("FlowPolicy")))
     candidates.append(Candidate("SBX SAC", sbx))
     candidates += [Candidate(_limit_name(policy), partial(limit, policy)) for policy in policies]
     return Benchmark(shape.title, "updates", candidates)
@@ -115,8 +112,7 @@ def _single_seed(shape: Shape, policies: Sequence[str]) -> Benchmark:
 
 def _stacked_seeds() -> Benchmark:
     def models(algorithm: str) -> list[SACFlow]:
-        block = zoo_block(algorithm, ENV_ID)
-        block["compile"] = True
+        block = {**zoo_block(algorithm, ENV_ID), "compile": True}
         return [prefilled(SACFlow, SHAPES[0], **block, seed=seed) for seed in range(N_SEEDS)]
 
     def stock() -> Work:
@@ -185,13 +181,7 @@ def products_alone(policies: Sequence[SACPolicy], batch_size: int, n_updates: in
     The critics run three times (targets, critic loss, actor loss) and backward twice: once for
     their weights and once only through to the actions.
 
-    Args:
-        policies: S policies of equal shape, stacked.
-        batch_size: Transitions per update and policy.
-        n_updates: Number of updates.
-
-    Returns:
-        Work that counts updates, summed over the policies.
+    The policies have equal shapes and are stacked. The work counts updates, summed over them.
     """
     n_policies = len(policies)
     critics = policies[0].critic.q_networks

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 import time
@@ -20,51 +19,6 @@ DEFAULT_FOLDER = Path("density_results")
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    parser = _parser()
-    args = parser.parse_args(arguments)
-    # Slow imports that --help does not need.
-    try:
-        from sb3_flowpolicy.common.files import write_text
-        from sb3_flowpolicy.common.machine import machine
-        from sb3_flowpolicy.density.report import write_report
-        from sb3_flowpolicy.density.run import run_studies
-        from sb3_flowpolicy.density.studies import FULL, QUICK, STUDIES
-    except ModuleNotFoundError as error:
-        parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
-
-    if args.action == "list":
-        for study in STUDIES.values():
-            print(f"{study.name} ({study.claim}): {study.title}")
-            print(f"  models: {', '.join(study.recipes)}")
-            print(f"  thesis: {study.thesis}\n  criteria: {study.rules}\n")
-        return
-    try:
-        if args.action == "report":
-            origin = args.out / "origin.txt"
-            print(write_report(args.out, origin.read_text() if origin.exists() else ""))
-            return
-        begin, commit = time.monotonic(), machine()["commit"] or "unknown (no source tree)"
-        run_studies(
-            args.names or list(STUDIES),
-            range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds)),
-            QUICK if args.quick else FULL,
-            args.out,
-            args.jobs,
-            progress=not args.no_progress,
-        )
-        used = os.times()
-        cpu = used.user + used.system + used.children_user + used.children_system
-        wall = time.monotonic() - begin
-        took = f"{wall / 60:.1f} minutes ({cpu / 60:.1f} minutes of processor time)"
-        given = sys.argv[1:] if arguments is None else arguments
-        command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
-        write_text(args.out / "origin.txt", f"Made by `{command}` at commit {commit}, in {took}.")
-        print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.density",
         description="Fit small normalizing flows to data in the plane, as in chapter 2.1 of the "
@@ -81,16 +35,46 @@ def _parser() -> argparse.ArgumentParser:
     add("--first-seed", type=int, default=0, help="first seed (default: 0)")
     add("--quick", action="store_true", help="two seeds, hardly trained, within a minute")
     add("--jobs", type=int, default=1, help="models fitted at the same time (default: 1)")
-    add("--no-progress", action="store_true", help="no progress bars")
     report = actions.add_parser("report", help="write README.md next to the results, and print it")
     for sub in (run, report):
-        sub.add_argument(
-            "--out",
-            type=Path,
-            default=DEFAULT_FOLDER,
-            help=f"folder of the results (default: {DEFAULT_FOLDER})",
+        folder = f"folder of the results (default: {DEFAULT_FOLDER})"
+        sub.add_argument("--out", type=Path, default=DEFAULT_FOLDER, help=folder)
+    args = parser.parse_args(arguments)
+    # Slow imports that --help does not need.
+    try:
+        from sb3_flowpolicy.common.files import write_text
+        from sb3_flowpolicy.common.machine import machine
+        from sb3_flowpolicy.density.report import write_report
+        from sb3_flowpolicy.density.run import run_studies
+        from sb3_flowpolicy.density.studies import FULL, QUICK, STUDIES
+    except ModuleNotFoundError as error:
+        parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
+
+    if args.action == "list":
+        for study in STUDIES.values():
+            print(f"{study.name} ({study.claim}): {study.title}")
+            print(f"  models: {', '.join(study.epochs)}")
+            print(f"  thesis: {study.thesis}\n  criteria: {study.rules}\n")
+        return
+    try:
+        if args.action == "report":
+            print(write_report(args.out))
+            return
+        begin, commit = time.monotonic(), machine()["commit"] or "unknown (no source tree)"
+        run_studies(
+            args.names or list(STUDIES),
+            range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds)),
+            QUICK if args.quick else FULL,
+            args.out,
+            args.jobs,
         )
-    return parser
+        took = f"{(time.monotonic() - begin) / 60:.1f} minutes"
+        given = sys.argv[1:] if arguments is None else arguments
+        command = shlex.join(["python", "-m", "sb3_flowpolicy.density", *given])
+        write_text(args.out / "origin.txt", f"Made by `{command}` at commit {commit}, in {took}.")
+        print(f"{took}; results in {args.out}, to be read with: report --out {args.out}")
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -15,45 +14,27 @@ NOISE = 0.05
 TRAINING_ANGLES = np.arange(22) / 10
 POINTS_PER_ANGLE = 227
 
-# Gauss-Legendre nodes on the half circle, at most 0.04 apart: the relative error is below 1e-8 if
-# the noise is no smaller than that.
+# Gauss-Legendre nodes on the half circle, at most 0.04 apart, less than the noise: the relative
+# error is below 1e-8.
 N_NODES = 128
-MIN_NOISE = 0.04
 # Points scored at once: their distances to all nodes must fit into memory.
 CHUNK = 10_000
 # Spacing and margin of the integration grid.
 CELLS_PER_NOISE, MARGIN_IN_NOISE = 2, 8
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Points and their conditions.
-
-    Args:
-        points: Shape (N, 2).
-        condition: Shape (N, C); C = 0 without conditions.
-    """
+class Sample(NamedTuple):
+    """Points (N, 2) and their conditions (N, C); C = 0 without conditions."""
 
     points: np.ndarray
     condition: np.ndarray
 
 
-@dataclass(frozen=True)
-class Scaler:
-    """Shift and scale that standardize a training sample, also applied to all other samples.
-
-    Args:
-        mean: Shape (2,).
-        scale: Standard deviation, shape (2,).
-    """
+class Scaler(NamedTuple):
+    """Mean and standard deviation (2,) that standardize a training sample and all others."""
 
     mean: np.ndarray
     scale: np.ndarray
-
-    @classmethod
-    def of(cls, points: np.ndarray) -> Scaler:
-        """Measure mean and standard deviation of points (N, 2), like scikit-learn's scaler."""
-        return cls(points.mean(0), points.std(0))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Standardize points (..., 2)."""
@@ -65,37 +46,7 @@ class Scaler:
         return float(np.log(self.scale).sum())
 
 
-class DataSet(ABC):
-    """A distribution over points in the plane, possibly given a condition.
-
-    Attributes:
-        n_train: Size of a training sample.
-        condition_dim: Number C of conditioning variables, 0 for none.
-        standardized: Whether models are fitted to standardized points.
-    """
-
-    n_train: int
-    condition_dim: int
-    standardized: bool
-
-    @abstractmethod
-    def draw(self, n: int, seed: int) -> Sample:
-        """Draw n points in random order."""
-
-    @abstractmethod
-    def log_density(self, sample: Sample) -> np.ndarray:
-        """Return log p(x | condition) of the true density in nats, shape (N,)."""
-
-    @abstractmethod
-    def entropy(self) -> float:
-        """Return the differential entropy given the condition, in nats, before standardizing."""
-
-    def scaler(self, sample: Sample) -> Scaler:
-        """Return the scaler of a training sample: the identity unless standardized."""
-        return Scaler.of(sample.points) if self.standardized else Scaler(np.zeros(2), np.ones(2))
-
-
-class TwoMoons(DataSet):
+class TwoMoons:
     """Two interleaved half circles from scikit-learn's ``make_moons``.
 
     Args:
@@ -109,7 +60,6 @@ class TwoMoons(DataSet):
     """
 
     n_train = 2000
-    standardized = True
 
     def __init__(self, labelled: bool = False) -> None:
         self.labelled = labelled
@@ -120,26 +70,30 @@ class TwoMoons(DataSet):
         points, label = make_moons(n, noise=NOISE, random_state=seed)
         return Sample(points, label[:, None][:, : self.condition_dim].astype(float))
 
+    def scaler(self, sample: Sample) -> Scaler:
+        """Measure mean and standard deviation of a training sample."""
+        return Scaler(sample.points.mean(0), sample.points.std(0))
+
     def log_density(self, sample: Sample) -> np.ndarray:
-        """Score points under the moon of their label, or under the mixture of both moons."""
-        upper = moon_log_density(sample.points, NOISE)
+        """Score points, in nats, under the moon of their label, or under the mixture of both."""
+        upper = moon_log_density(sample.points)
         # A rotation by 180 degrees around (0.5, 0.25) maps one moon to the other.
-        lower = moon_log_density(np.array([1.0, 0.5]) - sample.points, NOISE)
+        lower = moon_log_density(np.array([1.0, 0.5]) - sample.points)
         if self.labelled:
             return np.where(sample.condition[:, 0] > 0.5, lower, upper)
         return np.logaddexp(upper, lower) - np.log(2)
 
     def entropy(self) -> float:
-        """Integrate over both moons, or over the first one, which is congruent to the other."""
+        """Return the entropy given the label, if any, in nats, before standardizing."""
         condition = np.zeros((1, self.condition_dim))
 
         def log_density(points: np.ndarray) -> np.ndarray:
             return self.log_density(Sample(points, condition.repeat(len(points), axis=0)))
 
-        return entropy_on_grid(log_density, (-1.0, -0.5), (2.0, 1.0), NOISE)
+        return entropy_on_grid(log_density, (-1.0, -0.5), (2.0, 1.0))
 
 
-class AngleMoons(DataSet):
+class AngleMoons:
     """Half circles around the origin that point in the direction of an angle.
 
     The upper half circle has angle 0; angle θ turns it by θ, counter-clockwise. The condition is
@@ -155,20 +109,14 @@ class AngleMoons(DataSet):
 
     n_train = len(TRAINING_ANGLES) * POINTS_PER_ANGLE
     condition_dim = 2
-    standardized = False
 
     def __init__(self, angles: np.ndarray = TRAINING_ANGLES) -> None:
         self.angles = np.asarray(angles, dtype=float)
 
     def draw(self, n: int, seed: int) -> Sample:
-        """Draw n points, equally many from each half circle.
-
-        Raises:
-            ValueError: If n is not a multiple of the number of angles.
-        """
-        per_angle, rest = divmod(n, len(self.angles))
-        if rest or n < 1:
-            raise ValueError(f"n must be a multiple of {len(self.angles)} angles, got {n}")
+        """Draw at least n points, equally many from each half circle."""
+        per_angle = -(-n // len(self.angles))
+        n = per_angle * len(self.angles)
         rng = np.random.default_rng(seed)
         order = rng.permutation(n)
         turn = self.angles.repeat(per_angle)[order]
@@ -178,15 +126,22 @@ class AngleMoons(DataSet):
         points += NOISE * rng.standard_normal(points.shape)
         return Sample(points, angle_condition(turn))
 
+    def scaler(self, sample: Sample) -> Scaler:
+        """Return the identity: the half circles are centered, with radius 1."""
+        return Scaler(np.zeros(2), np.ones(2))
+
     def log_density(self, sample: Sample) -> np.ndarray:
-        """Turn every point back to angle 0 and score it there."""
+        """Score points, in nats, after turning them back to angle 0."""
         sin, cos = sample.condition.T
         x, y = sample.points.T
-        return moon_log_density(np.stack([cos * x + sin * y, cos * y - sin * x], axis=1), NOISE)
+        return moon_log_density(np.stack([cos * x + sin * y, cos * y - sin * x], axis=1))
 
     def entropy(self) -> float:
-        """Integrate one half circle; all are congruent."""
-        return entropy_on_grid(lambda x: moon_log_density(x, NOISE), (-1, 0), (1, 1), NOISE)
+        """Return the entropy given the angle: that of any half circle."""
+        return entropy_on_grid(moon_log_density, (-1, 0), (1, 1))
+
+
+DataSet = TwoMoons | AngleMoons
 
 
 def angle_condition(angle: np.ndarray) -> np.ndarray:
@@ -194,7 +149,7 @@ def angle_condition(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(angle), np.cos(angle)], axis=-1)
 
 
-def moon_log_density(points: np.ndarray, noise: float) -> np.ndarray:
+def moon_log_density(points: np.ndarray) -> np.ndarray:
     r"""Log-density of the upper half of the unit circle, blurred by isotropic normal noise.
 
     .. math:: p(x) = \frac{1}{\pi} \int_0^\pi
@@ -202,30 +157,24 @@ def moon_log_density(points: np.ndarray, noise: float) -> np.ndarray:
 
     Args:
         points: Points x, shape (N, 2).
-        noise: Standard deviation :math:`\sigma`, at least 0.04.
 
     Returns:
         log p(x) in nats, shape (N,).
 
-    Raises:
-        ValueError: If the nodes do not resolve the noise.
-
     Example:
-        >>> on_the_arc, beside = moon_log_density(np.array([[0.0, 1.0], [0.0, 0.0]]), noise=0.05)
+        >>> on_the_arc, beside = moon_log_density(np.array([[0.0, 1.0], [0.0, 0.0]]))
         >>> bool(on_the_arc > 0 > beside)
         True
     """
-    if not noise >= MIN_NOISE:
-        raise ValueError(f"noise must be at least {MIN_NOISE}, got {noise}")
     node, weight = np.polynomial.legendre.leggauss(N_NODES)
     angle = 0.5 * np.pi * (node + 1)
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     # The weights sum to 2, so half of them is a distribution over the arc.
-    log_weight = np.log(0.5 * weight) - np.log(2 * np.pi * noise**2)
+    log_weight = np.log(0.5 * weight) - np.log(2 * np.pi * NOISE**2)
     scores = [np.empty(0)]
     for start in range(0, len(points), CHUNK):
         distance = ((points[start : start + CHUNK, None, :] - arc) ** 2).sum(-1)
-        scores.append(logsumexp(log_weight - distance / (2 * noise**2), axis=1))
+        scores.append(logsumexp(log_weight - distance / (2 * NOISE**2), axis=1))
     return np.concatenate(scores)
 
 
@@ -233,7 +182,7 @@ def entropy_on_grid(
     log_density: Callable[[np.ndarray], np.ndarray],
     low: tuple[float, float],
     high: tuple[float, float],
-    noise: float,
+    noise: float = NOISE,
 ) -> float:
     r"""Differential entropy :math:`-\int p \log p` of a density with normal noise.
 
@@ -245,9 +194,6 @@ def entropy_on_grid(
         low: Lower corner of a box around the data without the noise.
         high: Upper corner.
         noise: Standard deviation of the noise.
-
-    Returns:
-        The entropy in nats.
 
     Raises:
         ValueError: If the mass on the grid is not 1.

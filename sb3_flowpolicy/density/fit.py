@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch as th
 from torch.func import functional_call, stack_module_state, vmap
 from torch.optim.lr_scheduler import OneCycleLR
-from tqdm import tqdm
 
 from sb3_flowpolicy.density.models import FlowModel, make_model
 
-# Thesis 2.1.2.
+# Thesis 2.1.2, which also specifies Adam; the other constants are ours.
 BATCHES_PER_EPOCH = 2
+# Maximum step size: it rises for the first 30 % of the steps and then falls to zero.
+LEARNING_RATE = 2e-2
+# Standard deviation of the normal noise that is added to the training points of each batch, in the
+# units of the model. It prevents overfitting to single points.
+JITTER = 0.03
+# Without a bound, one point in a gap of the data can make a flow with large scales diverge.
+MAX_GRAD_NORM = 1.0
+# Decay per step of the moving average of the weights. The averaged weights are scored, because the
+# weights themselves vary with the last batches.
+AVERAGING = 0.98
 # Parameter name -> values of all S copies, (S, *shape).
 Weights = dict[str, th.Tensor]
 
@@ -23,11 +32,6 @@ class Ensemble:
 
     Stacked along a leading axis, ten small networks cost far less than ten times one. Models that
     ``vmap`` cannot stack are evaluated one after the other, with the same result.
-
-    Args:
-        name: Name of the model.
-        condition_dim: Number C of conditioning variables.
-        seeds: One seed per copy.
 
     Example:
         >>> ensemble = Ensemble("realnvp", condition_dim=0, seeds=[0, 1, 2])
@@ -70,72 +74,29 @@ def _of(states: Weights, index: int) -> Weights:
     return {name: value[index] for name, value in states.items()}
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """How a model is trained. The thesis specifies Adam and two batches; the rest is ours.
-
-    Args:
-        epochs: Passes over the training sample.
-        learning_rate: Maximum step size of Adam: it rises for the first 30 % of the steps and
-            then falls to zero (torch's ``OneCycleLR``).
-        jitter: Standard deviation of the normal noise that is added to the training points of
-            each batch, in the units of the model. It prevents overfitting to single points.
-        max_grad_norm: Each seed's gradient is scaled down to this norm. Without it, one point in
-            a gap of the data can make a flow with large scales diverge.
-        averaging: Decay per step of the moving average of the weights. The averaged weights are
-            scored, because the weights themselves vary with the last batches.
-        check_every: Epochs between two evaluations of the validation sample.
-
-    References:
-        Noise Regularization for Conditional Density Estimation (Rothfuss et al., 2019);
-        Super-Convergence (Smith and Topin, 2018) for the one-cycle schedule.
-    """
-
-    epochs: int
-    learning_rate: float = 2e-2
-    jitter: float = 0.03
-    max_grad_norm: float = 1.0
-    averaging: float = 0.98
-    check_every: int = 10
-
-
-@dataclass(frozen=True)
-class Data:
-    """Samples of S seeds in the units of the models.
-
-    Args:
-        points: Shape (S, N, 2).
-        condition: Shape (S, N, C).
-    """
+class Data(NamedTuple):
+    """Samples of S seeds in the units of the models: points (S, N, 2) and conditions (S, N, C)."""
 
     points: th.Tensor
     condition: th.Tensor
 
 
-@dataclass(frozen=True)
-class Curves:
-    """Mean negative log-likelihoods in nats during training.
+class Curves(NamedTuple):
+    """Mean negative log-likelihoods in nats at T checks during the training of S seeds."""
 
-    Args:
-        epoch: Epochs done at each check, shape (T,).
-        train: Of the training sample, shape (T, S).
-        validation: Of the validation sample, shape (T, S).
-        best_epoch: Epoch with the best validation of each seed, shape (S,).
-    """
-
-    epoch: th.Tensor
-    train: th.Tensor
-    validation: th.Tensor
-    best_epoch: th.Tensor
+    epoch: th.Tensor  # (T,)
+    train: th.Tensor  # (T, S)
+    validation: th.Tensor  # (T, S)
+    best_epoch: th.Tensor  # (S,)
 
 
 def fit(
     ensemble: Ensemble,
     train: Data,
     validation: Data,
-    recipe: Recipe,
+    epochs: int,
     seed: int = 0,
-    progress: bool = False,
+    check_every: int = 10,
 ) -> Curves:
     """Train an ensemble and keep the weights with the best validation of each seed.
 
@@ -143,39 +104,38 @@ def fit(
         ensemble: S copies of a model; its weights are replaced.
         train: Training sample of each seed.
         validation: Validation sample of each seed. Report likelihoods of a third sample.
-        recipe: How to train.
+        epochs: Passes over the training sample.
         seed: Seed of the order of the points.
-        progress: Whether to show a progress bar.
+        check_every: Epochs between two evaluations of the validation sample.
 
-    Returns:
-        Likelihoods over the epochs.
+    References:
+        Noise Regularization for Conditional Density Estimation (Rothfuss et al., 2019);
+        Super-Convergence (Smith and Topin, 2018) for the one-cycle schedule.
     """
     generator = th.Generator().manual_seed(seed)
     n_seeds, n_points = train.points.shape[:2]
     raw = ensemble.weights
-    optimizer = th.optim.Adam(list(raw.values()), lr=recipe.learning_rate, fused=True)
-    schedule = OneCycleLR(
-        optimizer, recipe.learning_rate, total_steps=BATCHES_PER_EPOCH * recipe.epochs
-    )
+    optimizer = th.optim.Adam(list(raw.values()), lr=LEARNING_RATE, fused=True)
+    schedule = OneCycleLR(optimizer, LEARNING_RATE, total_steps=BATCHES_PER_EPOCH * epochs)
     average = {name: value.detach().clone() for name, value in raw.items()}
     best = {name: value.clone() for name, value in average.items()}
     best_nll, best_epoch = th.full((n_seeds,), th.inf), th.zeros(n_seeds, dtype=th.long)
     rows: list[tuple[int, th.Tensor, th.Tensor]] = []
 
-    bar = tqdm(range(1, recipe.epochs + 1), desc=ensemble.name, unit="epoch", disable=not progress)
-    for epoch in bar:
+    for epoch in range(1, epochs + 1):
         keys = th.rand(n_seeds, n_points, generator=generator)
         for batch in keys.argsort(dim=1).chunk(BATCHES_PER_EPOCH, dim=1):
-            points, condition = _take(train, batch)
-            points = points + recipe.jitter * th.randn(points.shape, generator=generator)
+            each = th.arange(n_seeds)[:, None]
+            points, condition = train.points[each, batch], train.condition[each, batch]
+            points = points + JITTER * th.randn(points.shape, generator=generator)
             optimizer.zero_grad()
             (-ensemble.log_prob(points, condition).mean(1)).sum().backward()
-            _clip(raw, recipe.max_grad_norm)
+            _clip(raw)
             optimizer.step()
             schedule.step()
             for name, value in average.items():
-                value.lerp_(raw[name].detach(), 1 - recipe.averaging)
-        if epoch % recipe.check_every and epoch != recipe.epochs:
+                value.lerp_(raw[name].detach(), 1 - AVERAGING)
+        if epoch % check_every and epoch != epochs:
             continue
         ensemble.weights = average
         nll = mean_nll(ensemble, validation)
@@ -185,10 +145,9 @@ def fit(
         best_nll, best_epoch = th.where(better, nll, best_nll), best_epoch.where(~better, epoch)
         for name, value in best.items():
             value[better] = average[name][better]
-        bar.set_postfix_str(f"validation {best_nll.mean():.3f} nats")
     ensemble.weights = best
-    epochs, train_nll, validation_nll = zip(*rows, strict=True)
-    return Curves(th.tensor(epochs), th.stack(train_nll), th.stack(validation_nll), best_epoch)
+    checked, train_nll, validation_nll = zip(*rows, strict=True)
+    return Curves(th.tensor(checked), th.stack(train_nll), th.stack(validation_nll), best_epoch)
 
 
 @th.no_grad()
@@ -197,16 +156,10 @@ def mean_nll(ensemble: Ensemble, data: Data) -> th.Tensor:
     return -ensemble.log_prob(data.points, data.condition).mean(1)
 
 
-def _take(data: Data, index: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """Select points: index (S, B) -> (S, B, 2), (S, B, C)."""
-    seed = th.arange(len(index))[:, None]
-    return data.points[seed, index], data.condition[seed, index]
-
-
-def _clip(weights: Weights, max_norm: float) -> None:
+def _clip(weights: Weights) -> None:
     """Clip the norm of each seed's gradient."""
     gradients = [value.grad for value in weights.values() if value.grad is not None]
     norm = th.stack([grad.flatten(1).square().sum(1) for grad in gradients]).sum(0).sqrt()
-    factor = (max_norm / norm).clamp(max=1)
+    factor = (MAX_GRAD_NORM / norm).clamp(max=1)
     for grad in gradients:
         grad.mul_(factor.view(-1, *[1] * (grad.ndim - 1)))

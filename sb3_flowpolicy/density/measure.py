@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.density.datasets import AngleMoons, DataSet, Sample, Scaler
+from sb3_flowpolicy.density.datasets import AngleMoons, Sample, Scaler
 from sb3_flowpolicy.density.fit import Curves, Data, Ensemble, fit, mean_nll
 from sb3_flowpolicy.density.models import FlowModel
 from sb3_flowpolicy.density.studies import STUDIES, Scale, angles_to_score
@@ -19,32 +19,21 @@ Row = dict[str, Any]
 # Added to a seed for each of its samples.
 VALIDATION_SEED, HELDOUT_SEED, ANGLE_SEED = 100_000, 200_000, 300_000
 # The integration grid is dense near the data and sparse beyond: x = sinh(u), up to +-74.
-REACH, CELLS = 5.0, 800
+REACH = 5.0
 # Grid points scored at once.
 CHUNK = 80_000
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A trained ensemble and its scores.
+    """A trained ensemble, the scalers of its seeds' points, its curves and its scores."""
 
-    Args:
-        study: Name of the study.
-        model: Name of the model.
-        ensemble: The trained copies.
-        scalers: Scaler of each seed's points.
-        curves: Likelihoods during training.
-        rows: One per seed, for ``fits.csv``.
-        angle_rows: One per seed and angle, for ``angles.csv``; empty for other studies.
-    """
-
-    study: str
     model: str
     ensemble: Ensemble
     scalers: list[Scaler]
     curves: Curves
-    rows: list[Row]
-    angle_rows: list[Row]
+    rows: list[Row]  # one per seed, for fits.csv
+    angle_rows: list[Row]  # one per seed and angle, for angles.csv; empty for other studies
 
     @property
     def middle(self) -> int:
@@ -52,49 +41,35 @@ class Fitted:
         order = sorted(range(len(self.rows)), key=lambda i: self.rows[i]["nll"])
         return order[(len(order) - 1) // 2]
 
+    def middle_model(self) -> FlowModel:
+        """Return the model of that seed."""
+        return self.ensemble.member(self.middle)
 
-def fit_and_measure(
-    study_name: str, model: str, seeds: Sequence[int], scale: Scale, progress: bool = False
-) -> Fitted:
-    """Draw each seed's data, train its copy, and score it on held-out data.
 
-    Args:
-        study_name: A key of ``STUDIES``.
-        model: One of the study's models.
-        seeds: Seeds of weights and data.
-        scale: How much to compute.
-        progress: Whether to show a progress bar.
-    """
+def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Scale) -> Fitted:
+    """Draw each seed's data, train its copy of a model, and score it on held-out data."""
     study = STUDIES[study_name]
     data = study.data()
     train = [data.draw(data.n_train, seed) for seed in seeds]
     scalers = [data.scaler(sample) for sample in train]
-    others = _round_up(scale.n_validation, data), _round_up(scale.n_heldout, data)
-    validation = [data.draw(others[0], VALIDATION_SEED + seed) for seed in seeds]
-    heldout = [data.draw(others[1], HELDOUT_SEED + seed) for seed in seeds]
+    validation = [data.draw(scale.n_validation, VALIDATION_SEED + seed) for seed in seeds]
+    heldout = [data.draw(scale.n_heldout, HELDOUT_SEED + seed) for seed in seeds]
 
     ensemble = Ensemble(model, data.condition_dim, seeds)
-    train_data = as_data(train, scalers)
-    curves = fit(
-        ensemble,
-        train_data,
-        as_data(validation, scalers),
-        study.recipe(model, scale),
-        seed=min(seeds),
-        progress=progress,
-    )
+    train_data, held = as_data(train, scalers), as_data(heldout, scalers)
+    epochs = max(2, study.epochs[model] // scale.shrink)
+    curves = fit(ensemble, train_data, as_data(validation, scalers), epochs, seed=min(seeds))
+    train_nll = mean_nll(ensemble, train_data)
     with th.no_grad():
-        train_nll = -ensemble.log_prob(train_data.points, train_data.condition).mean(1)
-        held = as_data(heldout, scalers)
         log_q = ensemble.log_prob(held.points, held.condition).double().numpy()
     entropy = data.entropy()
     accuracy = _accuracy(ensemble, held) if study_name == "two-moons-label" else None
+    conditions = th.from_numpy(study.conditions(scale)).float()
     rows = []
     for i, seed in enumerate(seeds):
         # The true density of the standardized points.
         log_p = data.log_density(heldout[i]) + scalers[i].log_volume
         gap = log_p - log_q[i]
-        conditions = th.from_numpy(study.conditions(scale)).float()
         integrals = [integral(ensemble.member(i), one, scale.cells) for one in conditions]
         rows.append(
             {
@@ -114,7 +89,7 @@ def fit_and_measure(
             }
         )
     angle_rows = _angle_rows(ensemble, scale) if study_name == "angle-moons" else []
-    return Fitted(study_name, model, ensemble, scalers, curves, rows, angle_rows)
+    return Fitted(model, ensemble, scalers, curves, rows, angle_rows)
 
 
 def as_data(samples: Sequence[Sample], scalers: Sequence[Scaler]) -> Data:
@@ -125,26 +100,22 @@ def as_data(samples: Sequence[Sample], scalers: Sequence[Scaler]) -> Data:
 
 
 @th.no_grad()
-def label_posterior(log_prob: Callable[[th.Tensor], th.Tensor], shape: Sequence[int]) -> th.Tensor:
-    """Return p(label = 1 | point) for labels that are equally frequent.
-
-    Args:
-        log_prob: Conditions (*shape, 1) -> log p(points | condition), shape (*shape).
-        shape: Shape of the points without their coordinates.
-    """
-    zero, one = (log_prob(th.full((*shape, 1), label)) for label in (0.0, 1.0))
-    return th.sigmoid(one - zero)
+def label_posterior(
+    log_prob: Callable[[th.Tensor, th.Tensor], th.Tensor], points: th.Tensor
+) -> th.Tensor:
+    """Return p(label = 1 | point) for equally frequent labels: points (*, 2) -> (*)."""
+    label = th.zeros_like(points[..., :1])
+    return th.sigmoid(log_prob(points, label + 1) - log_prob(points, label))
 
 
 def _accuracy(ensemble: Ensemble, held: Data) -> th.Tensor:
     """Return each seed's fraction of points that are more likely under their own label, (S,)."""
-    shape = held.points.shape[:-1]
-    posterior = label_posterior(lambda label: ensemble.log_prob(held.points, label), shape)
-    return ((posterior > 0.5) == (held.condition[..., 0] > 0.5)).double().mean(1)
+    more_likely = label_posterior(ensemble.log_prob, held.points) > 0.5
+    return (more_likely == (held.condition[..., 0] > 0.5)).double().mean(1)
 
 
 @th.no_grad()
-def integral(model: FlowModel, condition: th.Tensor, cells: int = CELLS) -> float:
+def integral(model: FlowModel, condition: th.Tensor, cells: int) -> float:
     r"""Integrate a density over the plane.
 
     .. math:: \int p(x)\,dx = \int p(\sinh u) \cosh u_1 \cosh u_2\, du
@@ -157,9 +128,6 @@ def integral(model: FlowModel, condition: th.Tensor, cells: int = CELLS) -> floa
         model: The density.
         condition: Its condition, shape (C,).
         cells: Grid points per axis.
-
-    Returns:
-        The integral: 1 for a density.
 
     Example:
         >>> from sb3_flowpolicy.density.models import make_model
@@ -195,9 +163,3 @@ def _angle_rows(ensemble: Ensemble, scale: Scale) -> list[Row]:
 
 def _standard_error(values: np.ndarray) -> float:
     return float(values.std(ddof=1) / math.sqrt(len(values)))
-
-
-def _round_up(n: int, data: DataSet) -> int:
-    """Round up to the next multiple of the number of angles or moons."""
-    n_groups = len(data.angles) if isinstance(data, AngleMoons) else 2
-    return -(-n // n_groups) * n_groups

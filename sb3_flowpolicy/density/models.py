@@ -19,12 +19,9 @@ ENCODER_UNITS = 16
 
 
 class FlowModel(nn.Module, ABC):
-    """A density over the plane, given a condition of C numbers (C = 0: none).
+    """A density over the plane, given a condition of C numbers (C = 0: none)."""
 
-    Attributes:
-        stackable: Whether ``torch.func.vmap`` can evaluate many copies at once.
-    """
-
+    # Whether torch.func.vmap can evaluate many copies at once.
     stackable = True
 
     @abstractmethod
@@ -39,9 +36,6 @@ class FlowModel(nn.Module, ABC):
 class OurRealNVP(FlowModel):
     """The policy's flow with a linear encoder of the condition; without one, the context is 1.
 
-    Args:
-        condition_dim: Number C of conditioning variables.
-
     Example:
         >>> model = OurRealNVP(condition_dim=0)
         >>> noise, none = th.randn(5, 2), th.zeros(5, 0)
@@ -55,16 +49,13 @@ class OurRealNVP(FlowModel):
         context_dim = ENCODER_UNITS if condition_dim else 1
         self.flow = RealNVP(2, context_dim, layers=LAYERS, hidden=HIDDEN)
 
-    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
-        return self.flow.log_prob(self.context(condition), points)
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
+        return self.flow.log_prob(self._context(condition), points)
 
-    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
-        return self.flow.rsample_and_log_prob(self.context(condition), noise)[0]
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
+        return self.flow.rsample_and_log_prob(self._context(condition), noise)[0]
 
-    def context(self, condition: th.Tensor) -> th.Tensor:
-        """Encode conditions: (N, C) -> (N, 16), or (N, 1) of ones if C = 0."""
+    def _context(self, condition: th.Tensor) -> th.Tensor:
         if self.encoder is None:
             return condition.new_ones(*condition.shape[:-1], 1)
         return self.encoder(condition)
@@ -73,7 +64,7 @@ class OurRealNVP(FlowModel):
     def after_each_layer(self, noise: th.Tensor, condition: th.Tensor) -> list[th.Tensor]:
         """Return the noise and its image after each coupling, L + 1 tensors (N, 2)."""
         images = [noise]
-        shares = list(self.flow.context_proj(self.context(condition)).chunk(LAYERS, dim=-1))
+        shares = list(self.flow.context_proj(self._context(condition)).chunk(LAYERS, dim=-1))
         value = noise
         for pair in self.flow.pairs:
             halves = list(value.split(1, dim=-1))
@@ -86,34 +77,25 @@ class OurRealNVP(FlowModel):
 
 
 class ZukoModel(FlowModel):
-    """A flow from zuko with the same linear encoder.
+    """A flow from zuko (Rozet et al., 2022) with the same linear encoder.
 
     Args:
         flow: Name of a class in ``zuko.flows``.
         condition_dim: Number C of conditioning variables.
-        stackable: See :class:`FlowModel`.
         **settings: Arguments of that class.
-
-    References:
-        Zuko: normalizing flows in PyTorch (Rozet et al., 2022).
     """
 
-    def __init__(
-        self, flow: str, condition_dim: int, stackable: bool = True, **settings: Any
-    ) -> None:
+    def __init__(self, flow: str, condition_dim: int, **settings: Any) -> None:
         super().__init__()
         # Imported late: it disables torch's validation of distributions in the whole process.
         zuko = import_module("zuko")
-        self.stackable = stackable
         self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
         self.flow = getattr(zuko.flows, flow)(2, ENCODER_UNITS if condition_dim else 0, **settings)
 
-    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
         return self._given(condition).log_prob(points)
 
-    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
         return self._given(condition).transform.inv(noise)
 
     def _given(self, condition: th.Tensor) -> Any:
@@ -128,36 +110,28 @@ class ZukoNAF(ZukoModel):
     the training undoes it. Here each network starts with an average slope of about 1 and with its
     bends spread over the data.
 
-    Args:
-        condition_dim: Number C of conditioning variables.
-
     References:
         Neural Autoregressive Flows (Huang et al., 2018).
     """
 
-    def __init__(self, condition_dim: int) -> None:
-        super().__init__(
-            "NAF",
-            condition_dim,
-            stackable=False,
-            transforms=LAYERS,
-            hidden_features=HIDDEN,
-            network={"hidden_features": (16,)},
-        )
-        for module in self.flow.modules():
-            if isinstance(module, import_module("zuko").flows.neural.MNN):
-                self._start_near_identity(module.network[0], module.network[-1])
+    stackable = False
 
-    @staticmethod
-    @th.no_grad()
-    def _start_near_identity(first: Any, last: Any) -> None:
-        """Set the weights of a monotone network, which uses their absolute values."""
-        # The inputs are the coordinate and 16 signals from the other coordinates.
-        first.weight[..., :1].uniform_(0.5, 2.0)
-        first.weight[..., 1:].uniform_(0.0, 1.0)
-        first.bias.uniform_(-2.0, 2.0)
-        last.weight.abs_().div_(last.weight.sum(-1, keepdim=True))
-        last.bias.zero_()
+    def __init__(self, condition_dim: int) -> None:
+        network = {"hidden_features": (16,)}
+        super().__init__(
+            "NAF", condition_dim, transforms=LAYERS, hidden_features=HIDDEN, network=network
+        )
+        with th.no_grad():
+            for module in self.flow.modules():
+                if isinstance(module, import_module("zuko").flows.neural.MNN):
+                    # The networks use the absolute values of their weights. Their inputs are the
+                    # coordinate and 16 signals from the other coordinates.
+                    first, last = module.network[0], module.network[-1]
+                    first.weight[..., :1].uniform_(0.5, 2.0)
+                    first.weight[..., 1:].uniform_(0.0, 1.0)
+                    first.bias.uniform_(-2.0, 2.0)
+                    last.weight.abs_().div_(last.weight.sum(-1, keepdim=True))
+                    last.bias.zero_()
 
 
 # Name -> (condition_dim -> model). Sizes are the thesis's. The spline flow is not in the thesis; it
@@ -176,12 +150,7 @@ MODELS: dict[str, Callable[[int], FlowModel]] = {
 
 
 def make_model(name: str, condition_dim: int, seed: int) -> FlowModel:
-    """Build a model with the initial weights of a seed.
-
-    Args:
-        name: A key of ``MODELS``.
-        condition_dim: Number C of conditioning variables, 0 for none.
-        seed: Seed of the weights; the global random state does not change.
+    """Build a model with the initial weights of a seed; the global random state does not change.
 
     Example:
         >>> sum(p.numel() for p in make_model("realnvp", 0, seed=0).parameters())

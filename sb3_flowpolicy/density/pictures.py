@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.stats import trim_mean
 
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.density.datasets import (
@@ -21,30 +22,25 @@ from sb3_flowpolicy.density.datasets import (
     TwoMoons,
     angle_condition,
 )
-from sb3_flowpolicy.density.figures import (
-    BLUE,
-    GREY,
-    LABELS,
-    ORANGE,
-    PICTURE_SEED,
-    curves_figure,
-    density_picture,
-    draw_density,
-    draw_points,
-    grid_of_panels,
-    layers_figure,
-    picture_noise,
-    pixel_centers,
-    sample,
-    save,
-)
-from sb3_flowpolicy.density.measure import Fitted, label_posterior
-from sb3_flowpolicy.density.models import OurRealNVP
+from sb3_flowpolicy.density.measure import CHUNK, Fitted, label_posterior
+from sb3_flowpolicy.density.models import FlowModel, OurRealNVP
 from sb3_flowpolicy.density.studies import Scale
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Seed of the noise and of the new points.
+PICTURE_SEED = 7
+BLUE, ORANGE, GREY = "#1f6fb4", "#d9662b", "#555555"
+# Model -> its label and its color.
+STYLES = {
+    "realnvp": ("RealNVP (ours)", BLUE),
+    "zuko-realnvp": ("RealNVP (zuko)", "#7fb2dc"),
+    "maf": ("MAF", ORANGE),
+    "maf-random": ("MAF, random orders", "#e9b08f"),
+    "naf": ("NAF", "#3a923a"),
+    "nsf": ("neural spline flow", "#8e5ea2"),
+}
 # Pictures show [-extent, extent]²: standardized moons, and half circles of radius 1.
 MOONS_EXTENT, ANGLES_EXTENT = 2.4, 1.5
 # Angles of the thesis's Fig. 2.9 and 2.10.
@@ -55,111 +51,137 @@ AROUND = np.arange(8) * np.pi / 4
 def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw curves (2.3), samples (2.4), densities (2.5) and layers (2.1)."""
     ours = fits[0]
-    save(curves_figure(fits, ours.rows[0]["entropy"]), folder / "two-moons-curves.png")
+    _save(_curves_figure(fits, ours.rows[0]["entropy"]), folder / "two-moons-curves.png")
 
-    data, seed = TwoMoons(), ours.ensemble.seeds[ours.middle]
-    scaler = ours.scalers[ours.middle]
-    points = scaler.apply(data.draw(data.n_train, seed).points)
-    plane = pixel_centers(MOONS_EXTENT, scale.pixels).numpy().astype(float)
+    data, scaler = TwoMoons(), ours.scalers[ours.middle]
+    points = scaler.apply(data.draw(data.n_train, ours.ensemble.seeds[ours.middle]).points)
+    plane = _pixel_centers(MOONS_EXTENT, scale.pixels).numpy().astype(float)
     raw = Sample(plane * scaler.scale + scaler.mean, np.zeros((len(plane), 0)))
     truth = np.exp(data.log_density(raw) + scaler.log_volume).reshape(scale.pixels, scale.pixels)
     for kind in ("samples", "density"):
-        figure, panels = grid_of_panels(len(fits) + 2, 4)
-        draw_density(panels[0], truth, MOONS_EXTENT, "true density")
-        draw_points(panels[1], points, MOONS_EXTENT, "training data", GREY)
+        figure, panels = _grid_of_panels(len(fits) + 2, 4)
+        _draw_density(panels[0], truth, MOONS_EXTENT, "true density")
+        _draw_points(panels[1], points, MOONS_EXTENT, "training data", GREY)
         for axes, fitted in zip(panels[2:], fits, strict=True):
+            model, label = fitted.middle_model(), STYLES[fitted.model][0]
             if kind == "samples":
-                samples = sample(fitted, np.zeros((data.n_train, 0)))
-                draw_points(axes, samples, MOONS_EXTENT, LABELS[fitted.model])
+                samples = _sample(model, np.zeros((data.n_train, 0)))
+                _draw_points(axes, samples, MOONS_EXTENT, label)
             else:
-                model = fitted.ensemble.member(fitted.middle)
                 density = density_picture(model, np.zeros(0), MOONS_EXTENT, scale.pixels)
-                draw_density(axes, density, MOONS_EXTENT, LABELS[fitted.model])
-        save(figure, folder / f"two-moons-{kind}.png")
+                _draw_density(axes, density, MOONS_EXTENT, label)
+        _save(figure, folder / f"two-moons-{kind}.png")
+    _save(_layers_figure(ours.middle_model()), folder / "two-moons-layers.png")
 
-    model = ours.ensemble.member(ours.middle)
+
+def _curves_figure(fits: Sequence[Fitted], limit: float) -> Figure:
+    """Draw likelihoods over epochs: every seed and the interquartile mean."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axes, title in ((left, "training sample"), (right, "sample not trained on")):
+        for fitted in fits:
+            curves, (label, color) = fitted.curves, STYLES[fitted.model]
+            nll = (curves.train if axes is left else curves.validation).numpy()
+            axes.plot(curves.epoch, nll, color=color, linewidth=0.5, alpha=0.35)
+            axes.plot(curves.epoch, trim_mean(nll, 0.25, axis=1), color=color, label=label)
+        axes.axhline(limit, color="black", linestyle="--", linewidth=1)
+        axes.annotate(
+            "entropy of the data: no model can be lower",
+            (0.98, limit),
+            (0, -4),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            ha="right",
+            va="top",
+            fontsize=7,
+        )
+        axes.set(xlabel="epoch", ylim=(limit - 0.15, limit + 1.0), title=title)
+        axes.spines[["top", "right"]].set_visible(False)
+    left.set_ylabel("negative log-likelihood, nats")
+    right.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _layers_figure(model: FlowModel) -> Figure:
+    """Draw the base samples after each layer, colored by their quadrant."""
     assert isinstance(model, OurRealNVP)
-    noise = picture_noise(4000)
+    noise = _picture_noise(4000)
     images = [image.numpy() for image in model.after_each_layer(noise, th.zeros(4000, 0))]
-    save(layers_figure(images, noise.numpy()), folder / "two-moons-layers.png")
+    # One color per quadrant: lower left, upper left, lower right, upper right.
+    right, up = (noise.numpy() >= 0).T
+    colors = np.array(["#2e8b57", "#e0a030", "#2f6db5", "#c0392b"])[2 * right + up]
+    figure, panels = _grid_of_panels(len(images), 3)
+    for index, (axes, points) in enumerate(zip(panels, images, strict=True)):
+        # Layers in between may shift and stretch all points: zoom each panel to its points.
+        x, y = points.mean(0)
+        extent = 1.05 * np.quantile(np.abs(points - [x, y]), 0.995)
+        titles = {0: "base: standard normal", len(images) - 1: "after layer 8: two moons"}
+        axes.scatter(points[:, 0], points[:, 1], s=1.5, c=colors, linewidths=0, rasterized=True)
+        axes.set(xlim=(x - extent, x + extent), ylim=(y - extent, y + extent))
+        axes.set_title(titles.get(index, f"after layer {index}"), fontsize=8)
+    return figure
 
 
 def draw_label(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
-    """Draw curves, samples of both labels (2.7), and the probability of each label."""
-    fitted = fits[0]
-    level = (0.5, "thesis: 0.5 nats within 250 epochs")
-    save(curves_figure(fits, fitted.rows[0]["entropy"], level), folder / "label-curves.png")
-
-    data, index = TwoMoons(labelled=True), fitted.middle
-    train = data.draw(data.n_train, fitted.ensemble.seeds[index])
-    points = fitted.scalers[index].apply(train.points)
-    samples = sample(fitted, train.condition)
+    """Draw samples of both labels (2.7), and the probability of each label."""
+    (fitted,) = fits
+    data, model = TwoMoons(labelled=True), fitted.middle_model()
+    scaler = fitted.scalers[fitted.middle]
+    train = data.draw(data.n_train, fitted.ensemble.seeds[fitted.middle])
     colors = np.where(train.condition[:, 0] > 0.5, ORANGE, BLUE)
-    figure, panels = grid_of_panels(3, 3, size=2.8)
-    draw_points(panels[0], points, MOONS_EXTENT, "training data", colors)
-    draw_points(panels[1], samples, MOONS_EXTENT, "RealNVP, given the label", colors)
+    figure, panels = _grid_of_panels(3, 3, size=2.8)
+    _draw_points(panels[0], scaler.apply(train.points), MOONS_EXTENT, "training data", colors)
+    samples = _sample(model, train.condition)
+    _draw_points(panels[1], samples, MOONS_EXTENT, "RealNVP, given the label", colors)
 
-    model = fitted.ensemble.member(index)
-    plane = pixel_centers(MOONS_EXTENT, scale.pixels)
-    posterior = label_posterior(lambda label: model(plane, label), plane.shape[:-1])
-    axes, box = panels[2], (-MOONS_EXTENT, MOONS_EXTENT, -MOONS_EXTENT, MOONS_EXTENT)
+    axes = panels[2]
+    posterior = label_posterior(model, _pixel_centers(MOONS_EXTENT, scale.pixels))
     axes.imshow(
         posterior.reshape(scale.pixels, scale.pixels).numpy(),
         origin="lower",
-        extent=box,
+        extent=(-MOONS_EXTENT, MOONS_EXTENT, -MOONS_EXTENT, MOONS_EXTENT),
         cmap=LinearSegmentedColormap.from_list("labels", ["#cfe0f0", "#ffffff", "#f6d9c8"]),
         vmin=0,
         vmax=1,
     )
     fresh = data.draw(1000, PICTURE_SEED)
-    x = th.from_numpy(fitted.scalers[index].apply(fresh.points)).float()
-    more_likely = label_posterior(lambda label: model(x, label), x.shape[:-1]).numpy() > 0.5
-    wrong = more_likely != (fresh.condition[:, 0] > 0.5)
-    draw_points(
-        axes,
-        x.numpy(),
-        MOONS_EXTENT,
-        f"more likely label; {wrong.sum()} of {len(x)} new points wrong",
-        np.where(fresh.condition[:, 0] > 0.5, ORANGE, BLUE),
-    )
+    x, second = scaler.apply(fresh.points), fresh.condition[:, 0] > 0.5
+    wrong = (label_posterior(model, th.from_numpy(x).float()).numpy() > 0.5) != second
+    title = f"more likely label; {wrong.sum()} of {len(x)} new points wrong"
+    _draw_points(axes, x, MOONS_EXTENT, title, np.where(second, ORANGE, BLUE))
     axes.scatter(x[wrong, 0], x[wrong, 1], s=30, facecolors="none", edgecolors="black")
-    save(figure, folder / "label-samples.png")
+    _save(figure, folder / "label-samples.png")
 
 
 def draw_angles(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
-    """Draw curves, samples (2.8), likelihood over the angle, and densities (2.9, 2.10)."""
-    fitted = fits[0]
-    save(curves_figure(fits, fitted.rows[0]["entropy"]), folder / "angles-curves.png")
-    save(_angle_nll_figure(fitted), folder / "angles-likelihood.png")
+    """Draw likelihood over the angle, samples (2.8), and densities (2.9, 2.10)."""
+    (fitted,) = fits
+    _save(_angle_nll_figure(fitted), folder / "angles-likelihood.png")
 
-    data, index = AngleMoons(), fitted.middle
-    train = data.draw(data.n_train, fitted.ensemble.seeds[index])
-    samples = sample(fitted, train.condition)
+    data, model = AngleMoons(), fitted.middle_model()
+    train = data.draw(data.n_train, fitted.ensemble.seeds[fitted.middle])
     color = np.arctan2(train.condition[:, 0], train.condition[:, 1])
-    figure, panels = grid_of_panels(2, 2, size=2.8)
-    draw_points(panels[0], train.points, ANGLES_EXTENT, "training data, 22 angles", color)
-    draw_points(panels[1], samples, ANGLES_EXTENT, "RealNVP, given the angle", color)
-    save(figure, folder / "angles-samples.png")
+    samples = _sample(model, train.condition)
+    figure, panels = _grid_of_panels(2, 2, size=2.8)
+    _draw_points(panels[0], train.points, ANGLES_EXTENT, "training data, 22 angles", color)
+    _draw_points(panels[1], samples, ANGLES_EXTENT, "RealNVP, given the angle", color)
+    _save(figure, folder / "angles-samples.png")
 
-    model = fitted.ensemble.member(index)
     for name, angles in (("between", BETWEEN), ("outside", AROUND)):
-        figure, panels = grid_of_panels(8, 4)
+        figure, panels = _grid_of_panels(8, 4)
         for axes, angle in zip(panels, angles, strict=True):
-            density = density_picture(model, angle_condition(angle), ANGLES_EXTENT, scale.pixels)
-            draw_density(axes, density, ANGLES_EXTENT, f"{angle:.2f} rad, {_kind(angle)}")
-            _draw_tips(axes, angle)
-        save(figure, folder / f"angles-{name}.png")
-    _animate(fitted, folder / "angles.gif", scale)
+            kind = "between" if angle < TRAINING_ANGLES[-1] else "outside"
+            if np.abs(TRAINING_ANGLES - angle).min() < 1e-6:
+                kind = "trained"
+            _draw_angle(axes, model, angle, scale.pixels, f"{angle:.2f} rad, {kind}")
+        _save(figure, folder / f"angles-{name}.png")
+    _animate(model, folder / "angles.gif", scale)
 
 
-def _kind(angle: float) -> str:
-    if np.abs(TRAINING_ANGLES - angle).min() < 1e-6:
-        return "trained"
-    return "between" if angle < TRAINING_ANGLES[-1] else "outside"
-
-
-def _draw_tips(axes: Axes, angle: float) -> None:
-    """Mark both tips of the true half circle."""
+def _draw_angle(axes: Axes, model: FlowModel, angle: float, pixels: int, title: str) -> None:
+    """Draw the density given an angle, and mark both tips of the true half circle."""
+    density = density_picture(model, angle_condition(np.asarray(angle)), ANGLES_EXTENT, pixels)
+    _draw_density(axes, density, ANGLES_EXTENT, title)
     tips = np.array([angle, angle + np.pi])
     axes.plot(np.cos(tips), np.sin(tips), "+", color="#7fd4ff", markersize=5, markeredgewidth=0.8)
 
@@ -168,22 +190,21 @@ def _angle_nll_figure(fitted: Fitted) -> Figure:
     """Draw the held-out likelihood over the angle, for every seed."""
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     wide, close = figure.subplots(1, 2, width_ratios=(1.4, 1))
-    columns = ("angle", "seed", "nll", "kind")
-    table = sorted(tuple(row[name] for name in columns) for row in fitted.angle_rows)
-    angles = sorted({row[0] for row in table})
-    nll = np.array([row[2] for row in table]).reshape(len(angles), -1)
-    kinds = {row[0]: row[3] for row in table}
-    limit = fitted.rows[0]["entropy"]
+    rows = sorted(fitted.angle_rows, key=lambda row: (row["angle"], row["seed"]))
+    n_seeds = len(fitted.ensemble.seeds)
+    angles = np.array([row["angle"] for row in rows[::n_seeds]])
+    kinds = np.array([row["kind"] for row in rows[::n_seeds]])
+    nll = np.array([row["nll"] for row in rows]).reshape(-1, n_seeds)
+    median, limit = np.median(nll, axis=1), fitted.rows[0]["entropy"]
     for axes in (wide, close):
         axes.plot(angles, nll, color=BLUE, linewidth=0.5, alpha=0.4)
-        axes.plot(angles, np.median(nll, axis=1), color=BLUE, label="median of the seeds")
+        axes.plot(angles, median, color=BLUE, label="median of the seeds")
         axes.axhline(limit, color="black", linestyle="--", linewidth=1, label="entropy of the data")
         axes.axvspan(0, 2.1, color="#000000", alpha=0.06, linewidth=0, label="trained range")
         axes.set(xlabel="angle, radian")
         axes.spines[["top", "right"]].set_visible(False)
     for kind, marker in (("trained", "o"), ("between", "x")):
-        chosen = [i for i, angle in enumerate(angles) if kinds[angle] == kind]
-        x, y = np.array(angles)[chosen], np.median(nll, axis=1)[chosen]
+        x, y = angles[kinds == kind], median[kinds == kind]
         close.plot(x, y, marker, color=BLUE, markersize=4, label=f"{kind} angles, median")
     wide.set(ylabel="held-out NLL, nats", yscale="symlog", title="full circle")
     wide.set_ylim(bottom=limit - 0.5)
@@ -192,27 +213,97 @@ def _angle_nll_figure(fitted: Fitted) -> Figure:
     return figure
 
 
-def _animate(fitted: Fitted, path: Path, scale: Scale) -> None:
+def _animate(model: FlowModel, path: Path, scale: Scale) -> None:
     """Turn the condition by a full circle; the title says whether the angle was trained."""
-    model = fitted.ensemble.member(fitted.middle)
     frames = []
     for angle in np.linspace(0, 2 * np.pi, scale.frames, endpoint=False):
-        condition = angle_condition(angle)
-        density = density_picture(model, condition, ANGLES_EXTENT, scale.pixels // 2)
-        figure, (axes,) = grid_of_panels(1, 1, size=2.4)
+        figure, (axes,) = _grid_of_panels(1, 1, size=2.4)
         inside = angle <= TRAINING_ANGLES[-1]
         state = "within the trained range" if inside else "never trained"
-        draw_density(axes, density, ANGLES_EXTENT, f"{angle:.1f} rad, {state}")
-        _draw_tips(axes, angle)
-        frames.append(_as_image(figure))
+        _draw_angle(axes, model, angle, scale.pixels // 2, f"{angle:.1f} rad, {state}")
+        figure.set_dpi(90)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba()))
+        frames.append(image.convert("RGB").quantize(48))
     with replacing(path) as draft:
         frames[0].save(
             draft, format="gif", save_all=True, append_images=frames[1:], duration=120, loop=0
         )
 
 
-def _as_image(figure: Figure) -> Image.Image:
-    figure.set_dpi(90)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(48)
+def _grid_of_panels(n_panels: int, n_columns: int, size: float = 2.1) -> tuple[Figure, list[Axes]]:
+    """Return a figure of square panels without ticks, filled row by row."""
+    n_rows = -(-n_panels // n_columns)
+    figure = Figure(figsize=(size * n_columns, (size + 0.25) * n_rows), layout="constrained")
+    panels = [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_panels)]
+    for axes in panels:
+        axes.set(xticks=[], yticks=[], aspect="equal")
+    return figure, panels
+
+
+def _draw_points(
+    axes: Axes, points: np.ndarray, extent: float, title: str, color: str | np.ndarray = BLUE
+) -> None:
+    """Scatter points (N, 2); those outside [-extent, extent] are counted in the title."""
+    outside = int((np.abs(points) > extent).any(axis=1).sum())
+    axes.scatter(points[:, 0], points[:, 1], s=2.0, c=color, linewidths=0, rasterized=True)
+    axes.set(xlim=(-extent, extent), ylim=(-extent, extent))
+    axes.set_title(title + (f" ({outside} outside)" if outside else ""), fontsize=8)
+
+
+def _draw_density(axes: Axes, density: np.ndarray, extent: float, title: str) -> None:
+    """Draw the square root of a density as brightness, so that thin bridges stay visible.
+
+    The brightest percent of the pixels may saturate.
+    """
+    bright = np.quantile(density[density > density.max() * 1e-3], 0.99)
+    box = (-extent, extent, -extent, extent)
+    image = np.sqrt(np.minimum(density / bright, 1))
+    axes.imshow(image, origin="lower", extent=box, cmap="magma", vmin=0, vmax=1)
+    axes.set_title(title, fontsize=8)
+
+
+@th.no_grad()
+def density_picture(
+    model: FlowModel, condition: np.ndarray, extent: float, pixels: int
+) -> np.ndarray:
+    """Evaluate p(. | condition) at the pixel centers of a square, from the lowest y and x up."""
+    scores = [
+        model(points, th.from_numpy(condition).float().expand(len(points), -1))
+        for points in _pixel_centers(extent, pixels).split(CHUNK)
+    ]
+    return th.cat(scores).exp().reshape(pixels, pixels).numpy()
+
+
+def _pixel_centers(extent: float, pixels: int) -> th.Tensor:
+    """Return the centers of the pixels of a square, row by row from the lowest: (pixels², 2)."""
+    center = ((th.arange(pixels) + 0.5) / pixels * 2 - 1) * extent
+    return th.cartesian_prod(center, center).flip(-1)
+
+
+def _picture_noise(n: int) -> th.Tensor:
+    """Return the same standard normal noise (n, 2) for every picture."""
+    return th.randn(n, 2, generator=th.Generator().manual_seed(PICTURE_SEED))
+
+
+@th.no_grad()
+def _sample(model: FlowModel, condition: np.ndarray) -> np.ndarray:
+    """Draw one point per condition: (N, C) -> (N, 2)."""
+    return model.sample(_picture_noise(len(condition)), th.from_numpy(condition).float()).numpy()
+
+
+def _save(figure: Figure, path: Path) -> None:
+    """Write a PNG of 128 colors, about half the size of a full-color one."""
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=110, format="png")
+        image = Image.open(draft).convert("RGB").quantize(128)
+        image.save(draft, format="png", optimize=True)
+
+
+# Study -> what draws its pictures.
+DRAW = {
+    "two-moons": draw_two_moons,
+    "two-moons-label": draw_label,
+    "angle-moons": draw_angles,
+}

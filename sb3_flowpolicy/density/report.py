@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
 from pathlib import Path
+from typing import Any
 
 from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.density.measure import Row
-from sb3_flowpolicy.density.results import read_csv
 from sb3_flowpolicy.density.studies import STUDIES, Study
 from sb3_flowpolicy.density.verdicts import CHECKS, by_model, interval, sound
 
@@ -34,10 +34,6 @@ PICTURES = {
         ),
     },
     "two-moons-label": {
-        "label-curves.png": (
-            "NLL over epochs",
-            "Training converges to 0.5 nats within 250 epochs.",
-        ),
         "label-samples.png": (
             "Data, samples given the label, and classification of new points by likelihood",
             "Fig. 2.7: model and data look extremely similar; scoring a point under both labels "
@@ -45,7 +41,6 @@ PICTURES = {
         ),
     },
     "angle-moons": {
-        "angles-curves.png": ("NLL over epochs", "Not shown."),
         "angles-samples.png": (
             "Data and samples, colored by angle",
             "Fig. 2.8: very similar; only the tips are slightly flatter.",
@@ -69,30 +64,22 @@ PICTURES = {
 }
 
 
-def write_report(folder: Path, origin: str) -> str:
-    """Write ``README.md`` into a folder of results.
-
-    Args:
-        folder: Folder that ``run`` has written to.
-        origin: The command and the commit of the results.
-
-    Returns:
-        The text.
-    """
+def write_report(folder: Path) -> str:
+    """Write ``README.md`` into a folder that ``run`` has written to, and return the text."""
     found = [study for study in STUDIES.values() if (folder / f"{study.name}-fits.csv").exists()]
     if not found:
         raise ValueError(f"out must be a folder that `run` has written to, got {str(folder)!r}")
+    origin = folder / "origin.txt"
     parts = [
         "# Density fitting: results",
-        origin,
+        origin.read_text() if origin.exists() else "",
         "Numbers are the interquartile mean over seeds with a 95 % bootstrap interval, in nats. "
         "*NLL* is the negative log-likelihood of points that were used neither for training nor "
         "for choosing the best epoch. *Gap* is its distance to that of the true density on the "
         "same points: the Kullback-Leibler divergence, negative only by sampling error. Pictures "
         "show the seed with the median NLL.",
     ]
-    parts += [_section(study, folder) for study in found]
-    text = "\n\n".join(parts) + "\n"
+    text = "\n\n".join([*parts, *(_section(study, folder) for study in found)]) + "\n"
     write_text(folder / "README.md", text)
     return text
 
@@ -102,34 +89,41 @@ def _section(study: Study, folder: Path) -> str:
     curves = read_csv(folder / f"{study.name}-curves.csv")
     path = folder / f"{study.name}-angles.csv"
     angles = read_csv(path) if path.exists() else []
-    verdicts = [*CHECKS[study.name](rows, curves, angles), *sound(rows)]
-    lines = [
+    models = ["| model | NLL | gap | train NLL | NLL of each seed |", "|---|---|---|---|---|"]
+    for model, own in by_model(rows).items():
+        cells = [interval([row[key] for row in own]) for key in ("nll", "gap", "train_nll")]
+        texts = ["{:.3f} [{:.3f}, {:.3f}]".format(*cell) for cell in cells]
+        each = " ".join(f"{row['nll']:.2f}" for row in own)
+        models.append(f"| {model} | {' | '.join(texts)} | {each} |")
+    criteria = ["| criterion | measured | holds |", "|---|---|---|"]
+    for rule, seen, holds in (*CHECKS[study.name](rows, curves, angles), *sound(rows)):
+        criteria.append(f"| {rule} | {seen} | {'yes' if holds else '**no**'} |")
+    parts = [
         f"## {study.claim} `{study.name}`: {study.title}",
         f"**The thesis:** {study.thesis}",
         f"**Entropy of the data**, the lower limit of the NLL: {rows[0]['entropy']:.3f} nats. "
         f"Seeds: {len({row['seed'] for row in rows})}.",
-        _table(rows),
-        "| criterion | measured | holds |\n|---|---|---|\n"
-        + "\n".join(
-            f"| {one.rule} | {one.seen} | {'yes' if one.holds else '**no**'} |" for one in verdicts
-        ),
+        "\n".join(models),
+        "\n".join(criteria),
     ]
-    lines += [
+    parts += [
         f"![{caption}]({name})\n\n*{caption}.* **Thesis:** {thesis}"
         for name, (caption, thesis) in PICTURES[study.name].items()
         if (folder / name).exists()
     ]
-    return "\n\n".join(lines)
+    return "\n\n".join(parts)
 
 
-def _table(rows: Sequence[Row]) -> str:
-    lines = ["| model | NLL | gap | train NLL | NLL of each seed |", "|---|---|---|---|---|"]
-    for model, own in by_model(rows).items():
-        cells = [_interval([row[key] for row in own]) for key in ("nll", "gap", "train_nll")]
-        each = " ".join(f"{row['nll']:.2f}" for row in own)
-        lines.append(f"| {model} | {' | '.join(cells)} | {each} |")
-    return "\n".join(lines)
+def read_csv(path: Path) -> list[Row]:
+    """Read rows; texts that look like numbers become numbers."""
+    with path.open(newline="") as file:
+        return [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
-def _interval(values: Sequence[float]) -> str:
-    return "{:.3f} [{:.3f}, {:.3f}]".format(*interval(values))
+def _number(text: str) -> Any:
+    for convert in (int, float):
+        try:
+            return convert(text)
+        except ValueError:
+            continue
+    return text

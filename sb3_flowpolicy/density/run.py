@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import multiprocessing
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -10,27 +11,17 @@ from pathlib import Path
 import torch as th
 from tqdm import tqdm
 
-from sb3_flowpolicy.density.measure import Fitted, fit_and_measure
-from sb3_flowpolicy.density.pictures import draw_angles, draw_label, draw_two_moons
-from sb3_flowpolicy.density.results import write_results
+from sb3_flowpolicy.common.files import replacing
+from sb3_flowpolicy.density.measure import Fitted, Row, fit_and_measure
+from sb3_flowpolicy.density.pictures import DRAW
 from sb3_flowpolicy.density.studies import STUDIES, Scale
 
-PICTURES = {
-    "two-moons": draw_two_moons,
-    "two-moons-label": draw_label,
-    "angle-moons": draw_angles,
-}
 # (study, model)
 Task = tuple[str, str]
 
 
 def run_studies(
-    names: Sequence[str],
-    seeds: Sequence[int],
-    scale: Scale,
-    folder: Path,
-    jobs: int = 1,
-    progress: bool = False,
+    names: Sequence[str], seeds: Sequence[int], scale: Scale, folder: Path, jobs: int = 1
 ) -> None:
     """Fit, measure and draw studies.
 
@@ -40,10 +31,8 @@ def run_studies(
         scale: How much to compute.
         folder: Folder of the results, created if missing.
         jobs: Models fitted at the same time, each in a process with one thread.
-        progress: Whether to show progress bars.
     """
-    unknown = [name for name in names if name not in STUDIES]
-    if unknown or not names:
+    if not set(names) <= STUDIES.keys():
         raise ValueError(f"studies must be among {list(STUDIES)}, got {list(names)}")
     if not seeds:
         raise ValueError("seeds must be at least 1, got 0")
@@ -51,34 +40,58 @@ def run_studies(
         raise ValueError(f"jobs must be at least 1, got {jobs}")
     folder.mkdir(parents=True, exist_ok=True)
     # The longest fits first, so that no process runs alone at the end.
-    tasks = [(name, model) for name in names for model in STUDIES[name].recipes]
+    tasks = [(name, model) for name in names for model in STUDIES[name].epochs]
     tasks.sort(key=lambda task: task[1] != "naf")
-    waiting = {name: len(STUDIES[name].recipes) for name in names}
     done: dict[Task, Fitted] = {}
-    for task, fitted in _fits(tasks, seeds, scale, jobs, progress):
-        done[task] = fitted
-        waiting[task[0]] -= 1
-        if not waiting[task[0]]:
-            fits = [done[task[0], model] for model in STUDIES[task[0]].recipes]
-            write_results(fits, folder)
-            PICTURES[task[0]](fits, folder, scale)
+    fits_as_completed = _fits(tasks, seeds, scale, jobs)
+    for (name, model), fitted in tqdm(fits_as_completed, total=len(tasks), unit="model"):
+        done[name, model] = fitted
+        if all((name, other) in done for other in STUDIES[name].epochs):
+            fits = [done[name, other] for other in STUDIES[name].epochs]
+            _write_tables(name, fits, folder)
+            DRAW[name](fits, folder, scale)
 
 
 def _fits(
-    tasks: Sequence[Task], seeds: Sequence[int], scale: Scale, jobs: int, progress: bool
+    tasks: Sequence[Task], seeds: Sequence[int], scale: Scale, jobs: int
 ) -> Iterable[tuple[Task, Fitted]]:
     """Yield fits as they complete."""
-    if jobs == 1 or len(tasks) == 1:
+    if jobs == 1:
         for task in tasks:
-            yield task, fit_and_measure(*task, seeds, scale, progress)
+            yield task, fit_and_measure(*task, seeds, scale)
         return
     # Forked children would inherit torch's threads in an unknown state.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=th.set_num_threads, initargs=(1,)
-    ) as pool:
+    with ProcessPoolExecutor(jobs, context, th.set_num_threads, (1,)) as pool:
         futures = {pool.submit(fit_and_measure, *task, seeds, scale): task for task in tasks}
-        bar = tqdm(as_completed(futures), total=len(tasks), unit="model", disable=not progress)
-        for future in bar:
-            bar.set_postfix_str("{}: {}".format(*futures[future]))
+        for future in as_completed(futures):
             yield futures[future], future.result()
+
+
+def _write_tables(name: str, fits: Sequence[Fitted], folder: Path) -> None:
+    """Write ``NAME-fits.csv``, ``NAME-curves.csv`` and, for angles, ``NAME-angles.csv``."""
+    curves = [
+        {"model": fitted.model, "seed": seed, "epoch": int(epoch), "train": train, "other": other}
+        for fitted in fits
+        for i, seed in enumerate(fitted.ensemble.seeds)
+        for epoch, train, other in zip(
+            fitted.curves.epoch,
+            fitted.curves.train[:, i].tolist(),
+            fitted.curves.validation[:, i].tolist(),
+            strict=True,
+        )
+    ]
+    write_csv(folder / f"{name}-fits.csv", [row for fitted in fits for row in fitted.rows])
+    write_csv(folder / f"{name}-curves.csv", curves)
+    angle_rows = [row for fitted in fits for row in fitted.angle_rows]
+    if angle_rows:
+        write_csv(folder / f"{name}-angles.csv", angle_rows)
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows of equal columns; floats with five digits after the point."""
+    with replacing(path) as draft, draft.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: f"{v:.5f}" if isinstance(v, float) else v for k, v in row.items()})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -18,8 +18,7 @@ INTEGRAL_TOLERANCE = 0.01
 SAMPLING_ERRORS = 4.0
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """A criterion, the measured value, and whether the criterion holds."""
 
     rule: str
@@ -33,32 +32,34 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
     return float(estimate.value), float(estimate.low), float(estimate.high)
 
 
-def sound(rows: Sequence[Row]) -> list[Verdict]:
-    """Check that each fitted density integrates to 1 and that none beats the true density.
+def by_model(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Group rows by their model, in order of appearance."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row["model"], []).append(row)
+    return groups
 
-    Args:
-        rows: Rows of a study's ``fits.csv``.
-    """
+
+def sound(rows: Sequence[Row]) -> list[Verdict]:
+    """Check that each fitted density integrates to 1 and that none beats the true density."""
     found = []
     for model, own in by_model(rows).items():
         # numpy's min and max, unlike Python's, return NaN, which fails the comparison.
         low = np.min([row["integral_low"] for row in own])
         high = np.max([row["integral_high"] for row in own])
-        found.append(
+        closest = np.min([row["gap"] / row["gap_se"] for row in own])
+        found += [
             Verdict(
                 f"{model}: every fitted density integrates to 1 ± {INTEGRAL_TOLERANCE}",
                 f"{low:.4f} to {high:.4f}",
                 bool(low >= 1 - INTEGRAL_TOLERANCE and high <= 1 + INTEGRAL_TOLERANCE),
-            )
-        )
-        closest = np.min([row["gap"] / row["gap_se"] for row in own])
-        found.append(
+            ),
             Verdict(
                 f"{model}: no seed beats the entropy by more than {SAMPLING_ERRORS:.0f} errors",
                 f"closest seed {closest:+.1f} standard errors from it",
                 bool(closest >= -SAMPLING_ERRORS),
-            )
-        )
+            ),
+        ]
     return found
 
 
@@ -66,28 +67,21 @@ def two_moons(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row])
     """D1: RealNVP against MAF and NAF."""
     nll = {model: interval([row["nll"] for row in own])[0] for model, own in by_model(rows).items()}
     above = {model: value - nll["realnvp"] for model, value in nll.items()}
-    return [
-        Verdict(
-            "RealNVP at least 0.05 nats below MAF",
-            f"{-above['maf']:+.3f} nats",
-            nll["realnvp"] <= nll["maf"] - 0.05,
-        ),
-        Verdict(
+    criteria = [
+        ("RealNVP at least 0.05 nats below MAF", -above["maf"], above["maf"] >= 0.05),
+        (
             "RealNVP at least 0.05 nats below MAF with random orders",
-            f"{-above['maf-random']:+.3f} nats",
-            nll["realnvp"] <= nll["maf-random"] - 0.05,
+            -above["maf-random"],
+            above["maf-random"] >= 0.05,
         ),
-        Verdict(
-            "NAF at most 0.05 nats above RealNVP",
-            f"{above['naf']:+.3f} nats",
-            nll["naf"] <= nll["realnvp"] + 0.05,
-        ),
-        Verdict(
+        ("NAF at most 0.05 nats above RealNVP", above["naf"], above["naf"] <= 0.05),
+        (
             "zuko's RealNVP within 0.05 nats of ours",
-            f"{above['zuko-realnvp']:+.3f} nats",
+            above["zuko-realnvp"],
             abs(above["zuko-realnvp"]) <= 0.05,
         ),
     ]
+    return [Verdict(rule, f"{seen:+.3f} nats", holds) for rule, seen, holds in criteria]
 
 
 def label(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
@@ -112,17 +106,21 @@ def label(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> 
 def angle(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
     """D3: between the training angles, and outside of them."""
     seeds = sorted({row["seed"] for row in angles})
-    nll = {
-        kind: interval([_mean_nll(angles, kind, seed) for seed in seeds])[0]
-        for kind in ("trained", "between")
+    of_kind = {
+        (kind, seed): [row for row in angles if (row["kind"], row["seed"]) == (kind, seed)]
+        for kind in ("trained", "between", "outside")
+        for seed in seeds
     }
-    difference = nll["between"] - nll["trained"]
-    correlations = [_correlation_with_distance(angles, seed) for seed in seeds]
+    between, trained = (
+        interval([np.mean([row["nll"] for row in of_kind[kind, seed]]) for seed in seeds])[0]
+        for kind in ("between", "trained")
+    )
+    correlations = [_correlation_with_distance(of_kind["outside", seed]) for seed in seeds]
     return [
         Verdict(
             "between training angles within 0.05 nats of training angles",
-            f"{difference:+.4f} nats",
-            abs(difference) <= 0.05,
+            f"{between - trained:+.4f} nats",
+            abs(between - trained) <= 0.05,
         ),
         Verdict(
             "worsens steadily over the first radian outside: rank correlation with distance > 0.8",
@@ -132,28 +130,14 @@ def angle(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> 
     ]
 
 
-CHECKS = {"two-moons": two_moons, "two-moons-label": label, "angle-moons": angle}
-
-
-def by_model(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group rows by their model, in order of appearance."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row["model"], []).append(row)
-    return groups
-
-
-def _mean_nll(angles: Sequence[Row], kind: str, seed: int) -> float:
-    chosen = [row["nll"] for row in angles if (row["kind"], row["seed"]) == (kind, seed)]
-    return float(np.mean(chosen))
-
-
-def _correlation_with_distance(angles: Sequence[Row], seed: int) -> float:
+def _correlation_with_distance(outside: Sequence[Row]) -> float:
     """Rank correlation of NLL and distance over the first radian outside, mean of both sides."""
-    outside = [row for row in angles if (row["kind"], row["seed"]) == ("outside", seed)]
     correlations = []
     for distance in (lambda angle: angle - TRAINING_ANGLES[-1], lambda angle: 2 * np.pi - angle):
         near = [(distance(row["angle"]), row["nll"]) for row in outside]
         near = [pair for pair in near if pair[0] < 1]
         correlations.append(float(spearmanr(*zip(*near, strict=True)).statistic))
     return float(np.mean(correlations))
+
+
+CHECKS = {"two-moons": two_moons, "two-moons-label": label, "angle-moons": angle}

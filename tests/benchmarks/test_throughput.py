@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import sys
@@ -13,7 +12,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks import environments, flows, learning, trust, updates
 from sb3_flowpolicy.benchmarks.learning import stock_block, zoo_block
-from sb3_flowpolicy.benchmarks.report import Row
 from sb3_flowpolicy.benchmarks.throughput import GROUPS, main
 from sb3_flowpolicy.benchmarks.updates import products_alone
 from sb3_flowpolicy.engine import Engine
@@ -35,9 +33,11 @@ def test_quick_run_writes_the_documented_json(
     assert [row["group"] for row in result["rows"]] == sorted(
         (row["group"] for row in result["rows"]), key=groups.index
     )
-    fields = {field.name for field in dataclasses.fields(Row)}
+    fields = (
+        "group contest name unit rate rates peer ratio limit limit_fraction warm_up_seconds note"
+    )
     for row in result["rows"]:
-        assert set(row) == fields
+        assert list(row) == fields.split()
         assert len(row["rates"]) == 5
         assert min(row["rates"]) <= row["rate"] <= max(row["rates"])
         assert row["rate"] > 0
@@ -64,7 +64,6 @@ def test_quick_run_of_everything(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--only", "nonsense"], "invalid choice: 'nonsense' .*updates.*learn.*environments.*flow"),
-        (["--threads", "0"], "--threads must be at least 1, got 0"),
         (["--rounds", "4"], "--rounds must be at least 5, got 4"),
         (["--json", "nowhere/at/all.json"], "--json must name a file in an existing directory"),
     ],
@@ -149,10 +148,9 @@ def test_zuko_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
         flows.benchmarks()[0].candidates[0].prepare()
 
 
-def test_a_run_leaves_the_number_of_threads_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-    monkeypatch.setattr(
-        "sb3_flowpolicy.benchmarks.throughput._run", lambda *_: seen.append(th.get_num_threads())
-    )
-    main(["--threads", "2"])
-    assert (seen, th.get_num_threads()) == ([2], 1)
+def test_threads_reach_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    monkeypatch.setattr(th, "set_num_threads", seen.append)
+    monkeypatch.setattr(flows, "benchmarks", lambda quick: [])
+    main(["--threads", "2", "--only", "flow"])
+    assert seen == [2]

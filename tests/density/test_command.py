@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from sb3_flowpolicy.density.__main__ import main
-from sb3_flowpolicy.density.report import PICTURES
-from sb3_flowpolicy.density.results import read_csv, write_csv
+from sb3_flowpolicy.density.report import PICTURES, read_csv
+from sb3_flowpolicy.density.run import write_csv
 from sb3_flowpolicy.density.studies import FULL, STUDIES, Study, angles_to_score
 from sb3_flowpolicy.density.verdicts import angle, interval, label, sound, two_moons
 
@@ -20,7 +20,7 @@ Row = dict[str, object]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("density") / "results"
-    main(["run", "--quick", "--no-progress", "--out", str(out)])
+    main(["run", "--quick", "--out", str(out)])
     return out
 
 
@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_quick_run_leaves_rows_for_every_model_and_seed(folder: Path, study: Study) -> None:
     rows = read_csv(folder / f"{study.name}-fits.csv")
     assert [(row["model"], row["seed"]) for row in rows] == [
-        (model, seed) for model in study.recipes for seed in (0, 1)
+        (model, seed) for model in study.epochs for seed in (0, 1)
     ]
     for row in rows:
         assert row["nll"] > row["entropy"]
@@ -38,7 +38,7 @@ def test_quick_run_leaves_rows_for_every_model_and_seed(folder: Path, study: Stu
         if row["model"] != "naf":
             assert row["integral_low"] == pytest.approx(1, abs=0.02)
     curves = read_csv(folder / f"{study.name}-curves.csv")
-    assert {row["model"] for row in curves} == set(study.recipes)
+    assert {row["model"] for row in curves} == set(study.epochs)
 
 
 @pytest.mark.parametrize("study", PICTURES)
@@ -73,7 +73,7 @@ def test_report_shows_every_study_and_check(
 @pytest.mark.slow  # each process imports everything again
 def test_several_jobs_give_the_same_numbers(folder: Path, tmp_path: Path) -> None:
     names = ["two-moons-label", "angle-moons"]
-    main(["run", *names, "--quick", "--no-progress", "--jobs", "2", "--out", str(tmp_path)])
+    main(["run", *names, "--quick", "--jobs", "2", "--out", str(tmp_path)])
     for name in names:
         one, two = (read_csv(path / f"{name}-fits.csv") for path in (folder, tmp_path))
         for ours, theirs in zip(one, two, strict=True):

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_flowpolicy.density.figures import density_picture
-from sb3_flowpolicy.density.fit import Data, Ensemble, Recipe, fit, mean_nll
+from sb3_flowpolicy.density.fit import Data, Ensemble, fit, mean_nll
 from sb3_flowpolicy.density.measure import integral
 from sb3_flowpolicy.density.models import (
     HIDDEN,
@@ -21,6 +20,7 @@ from sb3_flowpolicy.density.models import (
     ZukoNAF,
     make_model,
 )
+from sb3_flowpolicy.density.pictures import density_picture
 
 SEEDS = [0, 1, 2]
 
@@ -62,7 +62,7 @@ def test_fits_improve(name: str) -> None:
         shifted_normal(60, 1),
     )
     before = mean_nll(ensemble, validation)
-    curves = fit(ensemble, train, validation, Recipe(epochs=6, check_every=2))
+    curves = fit(ensemble, train, validation, epochs=6, check_every=2)
     after = mean_nll(ensemble, validation)
     assert (after < before).all()
     # The weights with the best validation are kept.
@@ -78,7 +78,7 @@ def test_seeds_are_independent() -> None:
     nll = []
     for data in (train, wild):
         ensemble = Ensemble("realnvp", 0, SEEDS)
-        fit(ensemble, data, validation, Recipe(epochs=5, check_every=1))
+        fit(ensemble, data, validation, epochs=5, check_every=1)
         nll.append(mean_nll(ensemble, validation))
     th.testing.assert_close(nll[0][0], nll[1][0])
     assert not th.isclose(nll[0][1], nll[1][1])
@@ -88,7 +88,7 @@ def test_fitting_is_reproducible() -> None:
     weights = []
     for _ in range(2):
         ensemble = Ensemble("realnvp", 0, SEEDS)
-        fit(ensemble, shifted_normal(50, 0), shifted_normal(50, 1), Recipe(epochs=3))
+        fit(ensemble, shifted_normal(50, 0), shifted_normal(50, 1), epochs=3)
         weights.append(ensemble.weights)
     for key, value in weights[0].items():
         th.testing.assert_close(value, weights[1][key], rtol=0, atol=0)
