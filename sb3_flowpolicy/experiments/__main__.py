@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
 from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.runner import adopt, results_folder, run_local, unfinished
+from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
 from sb3_flowpolicy.experiments.work import (
     FIRST_SEED,
     QUICK_SEEDS,
@@ -89,12 +89,7 @@ def _run(args: argparse.Namespace) -> None:
     )
     out = args.out or OUT[args.profile]
     with results_folder(out, plan) as folder:
-        left = unfinished(folder, plan)
-        adopted = adopt(folder, left)
-        for source in sorted(set(adopted.values())):
-            shared = [key for key, name in adopted.items() if name == source]
-            print(f"Taken from {source}, which did the same: {', '.join(shared)}")
-        items = [item for item in left if item.key not in adopted]
+        items = unfinished(folder, plan)
         finished = {item.key for item in plan.items} - {item.key for item in items}
         print(
             f"{experiment.name} ({experiment.claim}): {len(plan.items)} items of {plan.steps:,} "

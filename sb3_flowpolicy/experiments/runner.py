@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import queue
-import shutil
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -17,10 +15,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from sb3_flowpolicy.common.machine import machine
-from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder, commits_of, read_settings
+from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
 from sb3_flowpolicy.experiments.work import Plan, WorkItem, describe, item_seconds
 
 # OpenMP and numba read these when a process starts: one thread each, one process per core.
@@ -64,61 +60,6 @@ def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
         else:
             files.rows_of_seeds(describe(item), done)
     return found
-
-
-def adopt(folder: Path, items: Sequence[WorkItem]) -> dict[str, str]:
-    """Copy finished items of other experiments that did exactly the same work.
-
-    Items are the same if everything that results depend on is equal, including the commit and the
-    versions. Nothing is copied if the commit is unknown or source files differ from it, if an item
-    was begun or continued at another commit, or if its files have changed since it was finished.
-
-    Args:
-        folder: Folder of the experiment, claimed; others lie beside it.
-        items: The items still to be done.
-
-    Returns:
-        Key of each copied item to the experiment that it came from.
-
-    Raises:
-        ValueError: If a file of another experiment is corrupt; the message names it.
-    """
-    here = machine()
-    adopted: dict[str, str] = {}
-    if here["commit"] is None or here["commit"].endswith("-dirty"):
-        return adopted
-    wanted = {_work_of(describe(item)): item.key for item in items}
-    for other in EXPERIMENTS:  # ignore unrelated folders
-        settings = None if other == folder.name else read_settings(folder.parent / other)
-        for key, described in (settings or {"items": {}})["items"].items():
-            mine = wanted.get(_work_of(described))
-            if mine is None or mine in adopted:
-                continue
-            there = ItemFiles(folder.parent / other, key)
-            done = there.read_done()
-            if done is not None and _same_code(done, here) and there.damage(done) is None:
-                _copy(there, ItemFiles(folder, mine), done)
-                adopted[mine] = other
-    return adopted
-
-
-def _same_code(done: dict[str, Any], here: dict[str, Any]) -> bool:
-    return commits_of(done) == [here["commit"]] and done["machine"]["versions"] == here["versions"]
-
-
-def _work_of(described: dict[str, Any]) -> str:
-    """Return everything but the experiment's own names, as text: in files tuples are lists."""
-    work = {k: v for k, v in described.items() if k not in ("setting", "agent")}
-    return json.dumps(work, sort_keys=True)
-
-
-def _copy(there: ItemFiles, here: ItemFiles, done: dict[str, Any]) -> None:
-    shutil.rmtree(here.checkpoints, ignore_errors=True)
-    for source, target in ((there.table, here.table), (there.details, here.details)):
-        target.unlink(missing_ok=True)
-        if source.exists():
-            shutil.copyfile(source, target)
-    here.finish({**done, "adopted_from": f"{there.folder.name}/{there.key}"})
 
 
 def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
