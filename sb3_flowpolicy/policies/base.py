@@ -87,7 +87,9 @@ def check_net_arch(net_arch: Any, required: set[str], allowed: set[str]) -> None
     """Check the units per layer: None, a list, or a mapping with one for actor and critic each."""
     if isinstance(net_arch, Mapping):
         if not required <= set(net_arch) <= allowed:
-            raise ValueError(f"net_arch must be a dict with the keys {allowed}, got {net_arch!r}")
+            raise ValueError(
+                f"net_arch must be a dict with the keys {sorted(allowed)}, got {net_arch!r}"
+            )
         for arch in net_arch.values():
             layer_sizes("net_arch", arch)
     elif net_arch is not None:
