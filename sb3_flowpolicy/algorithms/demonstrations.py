@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pkgutil
-import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -112,20 +111,16 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     """
     if isinstance(source, Mapping):
         arrays = source
-    elif isinstance(source, str | Path) and zipfile.is_zipfile(source):
+    else:
         try:
             with np.load(source, allow_pickle=False) as file:
                 arrays = {key: file[key] for key in KEYS if key in file}
         # On damaged files numpy, zipfile and zlib raise many types of exceptions.
         except Exception as error:
             raise ValueError(
-                f"demonstrations must be an .npz file of arrays of numbers, got {source} "
-                f"({type(error).__name__}: {error})"
+                f"demonstrations must be arrays or an .npz file of arrays of numbers, got "
+                f"{str(source)!r} ({type(error).__name__}: {error})"
             ) from error
-    else:
-        raise ValueError(
-            f"demonstrations must be arrays or an .npz file that exists, got {source!r}"
-        )
     missing = [key for key in KEYS if key not in arrays]
     if missing:
         raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")

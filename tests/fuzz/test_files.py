@@ -87,12 +87,10 @@ def test_demonstrations_are_never_unpickled(tmp_path: Path) -> None:
     trace, path = tmp_path / "executed", tmp_path / "demos.npz"
     objects = np.array([Evil(trace)] * 6, dtype=object)
     path.write_bytes(npz(rewards=objects))
-    with pytest.raises(
-        ValueError, match=r"must be an \.npz file of arrays of numbers, got .*demos"
-    ):
+    with pytest.raises(ValueError, match=r"an \.npz file of arrays of numbers, got .*demos"):
         load_demonstrations(path)
     path.write_bytes(pickle.dumps(Evil(trace)))
-    with pytest.raises(ValueError, match=r"must be arrays or an \.npz file that exists"):
+    with pytest.raises(ValueError, match=r"must be arrays or an \.npz file of arrays of numbers"):
         load_demonstrations(path)
     assert not trace.exists()
     np.load(io.BytesIO(npz(rewards=objects)), allow_pickle=True)["rewards"]
@@ -107,7 +105,7 @@ def test_arrays_that_promise_more_than_they_have_are_refused(tmp_path: Path) -> 
             member = io.BytesIO()
             np.lib.format.write_array_header_1_0(member, head)
             archive.writestr(f"{key}.npy", member.getvalue())
-    with pytest.raises(ValueError, match=r"must be an \.npz file of arrays of numbers"):
+    with pytest.raises(ValueError, match=r"an \.npz file of arrays of numbers, got"):
         load_demonstrations(path)
 
 
