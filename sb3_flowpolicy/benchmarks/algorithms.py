@@ -11,10 +11,9 @@ import sys
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -63,29 +62,17 @@ CANDIDATES: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(NamedTuple):
     """An environment with the number of steps and the settings of each algorithm."""
 
     env_id: str
     steps: dict[str, int]
     settings: dict[str, dict[str, Any]]
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] | None = None
 
 
 _OFF_POLICY = {"learning_starts": 1000, "buffer_size": 100_000, "batch_size": 256}
 _NARROW = {"net_arch": {"pi": [64, 64], "qf": [128, 128]}}
-_PPO_TUNNEL = {
-    "n_envs": 8,
-    "n_steps": 64,
-    "batch_size": 128,
-    "n_epochs": 10,
-    "gamma": 0.8,
-    "gae_lambda": 0.9,
-    "learning_rate": 1e-3,
-    "ent_coef": 0.01,
-    "policy_kwargs": {"net_arch": [32, 32]},
-}
 TASKS = {
     "pendulum": Task(
         "Pendulum-v1",
@@ -121,15 +108,24 @@ TASKS = {
             },
         },
     ),
-    **{
-        f"tunnel-{count}": Task(
-            "TunnelDiagonal-v0",
-            {"ppo": 120_000},
-            {"ppo": _PPO_TUNNEL},
-            {"total_dims": count, "coupled_dims": count},
-        )
-        for count in (2, 4, 8)
-    },
+    "tunnel-2": Task(
+        "TunnelDiagonal-v0",
+        {"ppo": 120_000},
+        {
+            "ppo": {
+                "n_envs": 8,
+                "n_steps": 64,
+                "batch_size": 128,
+                "n_epochs": 10,
+                "gamma": 0.8,
+                "gae_lambda": 0.9,
+                "learning_rate": 1e-3,
+                "ent_coef": 0.01,
+                "policy_kwargs": {"net_arch": [32, 32]},
+            },
+        },
+        {"total_dims": 2, "coupled_dims": 2},
+    ),
 }
 COLUMNS = ("task", "algorithm", "policy", "seed", "step", "test_return", "test_success", "seconds")
 _N_TESTS = 6

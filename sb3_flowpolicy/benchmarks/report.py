@@ -27,16 +27,16 @@ def rows(group: str, benchmark: Benchmark, timings: Sequence[Timing]) -> list[Ro
             "contest": benchmark.title,
             "name": one.name,
             "unit": benchmark.unit,
-            "rate": named[one.name].median,
-            "rates": named[one.name].rates,
+            "rate": timing.median,
+            "rates": timing.rates,
             "peer": benchmark.candidates[0].name,
-            "ratio": named[one.name].ratio_to(timings[0]),
+            "ratio": timing.ratio_to(timings[0]),
             "limit": one.limit,
-            "limit_fraction": one.limit and named[one.name].ratio_to(named[one.limit]),
-            "warm_up_seconds": named[one.name].warm_up_seconds,
-            "note": named[one.name].note,
+            "limit_fraction": one.limit and timing.ratio_to(named[one.limit]),
+            "warm_up_seconds": timing.warm_up_seconds,
+            "note": timing.note,
         }
-        for one in benchmark.candidates
+        for one, timing in zip(benchmark.candidates, timings, strict=True)
     ]
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch as th
 
 from sb3_flowpolicy.benchmarks.report import SCHEMA, Row, rows, table
-from sb3_flowpolicy.benchmarks.timing import MIN_ROUNDS, measure
+from sb3_flowpolicy.benchmarks.timing import measure
 from sb3_flowpolicy.common.files import write_json
 from sb3_flowpolicy.common.machine import machine
 
@@ -24,8 +24,6 @@ GROUPS = {
     "trust": "trust",
     "flow": "flows",
 }
-ROUNDS, TURN_SECONDS = 7, 0.5
-QUICK_TURN_SECONDS = 0.02
 
 _DESCRIPTION = """\
 Measure the speed of sb3_flowpolicy and of its baselines on this machine.
@@ -63,19 +61,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     only = f"measure one group: {', '.join(GROUPS)}; may be repeated (default: all)"
     add("--only", action="append", choices=list(GROUPS), metavar="GROUP", help=only)
     add("--threads", type=int, help=f"threads of torch (default here: {th.get_num_threads()})")
-    add("--rounds", type=int, help=f"default: {ROUNDS}, with --quick {MIN_ROUNDS}, the minimum")
     quick = "a trial of less than a minute, with few rows and short turns: do not quote its rates"
     add("--quick", action="store_true", help=quick)
     args = parser.parse_args(arguments)
-    rounds = args.rounds or (MIN_ROUNDS if args.quick else ROUNDS)
-    if rounds < MIN_ROUNDS:
-        parser.error(f"--rounds must be at least {MIN_ROUNDS}, got {rounds}")
     if args.json is not None and not args.json.absolute().parent.is_dir():
         parser.error(f"--json must name a file in an existing directory, got {args.json}")
     if args.threads is not None:
         th.set_num_threads(args.threads)
 
-    turn_seconds = QUICK_TURN_SECONDS if args.quick else TURN_SECONDS
+    rounds, turn_seconds = (5, 0.02) if args.quick else (7, 0.5)
     settings = {"quick": args.quick, "rounds": rounds, "turn_seconds": turn_seconds}
     here = machine()
     print(

@@ -8,9 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-# The fewest rounds whose median is worth quoting.
-MIN_ROUNDS = 5
-
 # Does a piece of work and returns its amount in the benchmark's unit (updates, steps, ...).
 Work = Callable[[], float]
 
@@ -66,7 +63,7 @@ class Timing:
 
 def measure(
     benchmark: Benchmark,
-    rounds: int = MIN_ROUNDS,
+    rounds: int = 5,
     turn_seconds: float = 0.5,
     clock: Callable[[], float] = time.perf_counter,
 ) -> list[Timing]:
@@ -89,7 +86,7 @@ def measure(
     """
     timings, ready = [], []
     for candidate in benchmark.candidates:
-        _progress(f"{benchmark.title}: warm-up of {candidate.name}")
+        print(f"{benchmark.title}: warm-up of {candidate.name}", file=sys.stderr)
         timing, start = Timing(), clock()
         timings.append(timing)
         try:
@@ -101,7 +98,7 @@ def measure(
             timing.warm_up_seconds = clock() - start
             ready.append((timing, work))
     for done in range(rounds):
-        _progress(f"{benchmark.title}: round {done + 1} of {rounds}")
+        print(f"{benchmark.title}: round {done + 1} of {rounds}", file=sys.stderr)
         for timing, work in ready:
             amount, elapsed, start = 0.0, 0.0, clock()
             while elapsed < turn_seconds:
@@ -109,7 +106,3 @@ def measure(
                 elapsed = clock() - start
             timing.rates.append(amount / elapsed)
     return timings
-
-
-def _progress(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

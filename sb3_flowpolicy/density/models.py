@@ -49,10 +49,12 @@ class OurRealNVP(FlowModel):
         context_dim = ENCODER_UNITS if condition_dim else 1
         self.flow = RealNVP(2, context_dim, layers=LAYERS, hidden=HIDDEN)
 
-    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """See :class:`FlowModel`."""
         return self.flow.log_prob(self._context(condition), points)
 
-    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """See :class:`FlowModel`."""
         return self.flow.rsample_and_log_prob(self._context(condition), noise)[0]
 
     def _context(self, condition: th.Tensor) -> th.Tensor:
@@ -92,10 +94,12 @@ class ZukoModel(FlowModel):
         self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
         self.flow = getattr(zuko.flows, flow)(2, ENCODER_UNITS if condition_dim else 0, **settings)
 
-    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
+    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """See :class:`FlowModel`."""
         return self._given(condition).log_prob(points)
 
-    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:  # noqa: D102
+    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """See :class:`FlowModel`."""
         return self._given(condition).transform.inv(noise)
 
     def _given(self, condition: th.Tensor) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     few |= {"policy_kwargs": {"net_arch": [8]}}
     rollout = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "normalize": True}
     settings = {"tqc": few, "crossq": few, "ppo": rollout}
-    task = replace(task, steps=dict.fromkeys(settings, 96), settings=settings)
+    task = task._replace(steps=dict.fromkeys(settings, 96), settings=settings)
     monkeypatch.setitem(algorithms.TASKS, "tunnel-2", task)
 
 
