@@ -43,7 +43,7 @@ class BreakAt(BaseCallback):
 
 @OFF_POLICY
 def test_a_broken_run_goes_on_bit_for_bit(algorithm: Any, tmp_path: Path) -> None:
-    """The coloured noise, and CrossQ's batch renormalisation, are part of what is resumed."""
+    """The colored noise, and CrossQ's batch renormalization, are part of what is resumed."""
     settings: Any = {"action_noise_color": 1.0, "ent_coef": "auto"}
     th.manual_seed(0)
     calm = make(algorithm, **settings).learn(90)
@@ -62,7 +62,7 @@ def test_a_broken_run_goes_on_bit_for_bit(algorithm: Any, tmp_path: Path) -> Non
 
 
 @OFF_POLICY
-def test_colour_changes_exploration_and_is_saved(algorithm: Any, tmp_path: Path) -> None:
+def test_color_changes_exploration_and_is_saved(algorithm: Any, tmp_path: Path) -> None:
     white, pink = (make(algorithm, action_noise_color=color).learn(60) for color in (0.0, 1.0))
     assert not np.array_equal(white.replay_buffer.actions, pink.replay_buffer.actions)
     pink.save(tmp_path / "model")

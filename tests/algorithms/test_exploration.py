@@ -1,4 +1,4 @@
-"""Coloured noise while collecting: the same actions at a fixed state, another way to go."""
+"""Colored noise while collecting: the same actions at a fixed state, another way to go."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coloured noise: the slope that was asked for, and standard normals at every single step."""
+"""Colored noise: the slope that was asked for, and standard normals at every single step."""
 
 from __future__ import annotations
 

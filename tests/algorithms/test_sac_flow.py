@@ -54,7 +54,7 @@ def test_random_steps_are_separate_from_learning_starts(
     assert model._n_updates == 80 - 30
 
 
-def test_fixed_temperature_stays_and_learned_one_moves_towards_the_target() -> None:
+def test_fixed_ent_coef_stays_and_learned_one_moves_towards_the_target() -> None:
     fixed = SACFlow("FlowPolicy", "Pendulum-v1", ent_coef=0.25, **FAST).learn(40)
     assert fixed.ent_coef_tensor.item() == 0.25
     high = SACFlow("FlowPolicy", "Pendulum-v1", target_entropy=50.0, **FAST).learn(40)

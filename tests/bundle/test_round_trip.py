@@ -114,7 +114,7 @@ def test_every_density_of_ours_is_among_the_cases() -> None:
 def test_acts_and_learns_on_as_if_never_saved(case: str, tmp_path: Path) -> None:
     model = CASES[case]().learn(60)
     path = model.save_safe(tmp_path / "model")
-    # The engine normalises what it draws from the buffer with the environment's statistics.
+    # The engine normalizes what it draws from the buffer with the environment's statistics.
     env = make_vec_env("Pendulum-v1", n_envs=2) if case == "statistics" else None
     loaded = SACFlow.load_safe(path, env, device="cpu")
     obs = model.observation_space.sample()

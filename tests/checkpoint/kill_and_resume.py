@@ -2,7 +2,7 @@
 
     python tests/checkpoint/kill_and_resume.py --moments 50
 
-trains on TunnelDiagonal-v0 in processes of their own, and compares parameters, optimiser moments,
+trains on TunnelDiagonal-v0 in processes of their own, and compares parameters, optimizer moments,
 replay buffers and logs bit for bit; only the columns of wall-clock time are left out.
 """
 
@@ -153,7 +153,7 @@ def _outcome(model: Any) -> dict[str, Any]:
     for name, value in model.policy.state_dict().items():
         found[f"parameters {name}"] = value
     learned = model.log_ent_coef
-    found["temperature"] = model.ent_coef_tensor if learned is None else learned.detach()
+    found["ent_coef"] = model.ent_coef_tensor if learned is None else learned.detach()
     for name, optimizer in optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
             found |= {f"optimizer {name} {index} {key}": value for key, value in state.items()}

@@ -140,11 +140,11 @@ def short(env: gym.Env) -> gym.Env:
 
 VARIANTS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
     "plain": (lambda: gym.make(ENV), {}),
-    "fixed temperature, another density": (
+    "fixed entropy coefficient, another density": (
         lambda: gym.make("TunnelCircle-v0"),
         {"policy": "LowRankPolicy", "ent_coef": 0.1, "random_steps": 40},
     ),
-    "several normalised environments": (normalized, {"learning_rate": lambda left: left * 1e-3}),
+    "several normalized environments": (normalized, {"learning_rate": lambda left: left * 1e-3}),
     "stacked frames": (lambda: VecFrameStack(make_vec_env(ENV, n_envs=2), 3), {"train_freq": 3}),
     "batched environments": (lambda: make_batched_env("SquareHold-v0", 2), {}),
     "updates per episode": (lambda: gym.make(ENV), {"train_freq": (1, "episode")}),

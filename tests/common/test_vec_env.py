@@ -1,4 +1,4 @@
-"""Batched environments behave for SB3 as its own vectorisation does."""
+"""Batched environments look to SB3 like its own vectorization does."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_flowpolicy.common.vec_env import BatchedVecEnv, make_batched_env
         ("TunnelDiagonal-v0", {"width": 0.2, "start_noise": 0.1}),
     ],
 )
-def test_equals_sb3s_own_vectorisation(env_id: str, kwargs: dict) -> None:
+def test_equals_sb3s_own_vectorization(env_id: str, kwargs: dict) -> None:
     ours = make_batched_env(env_id, 3, seed=7, **kwargs)
     theirs = make_vec_env(env_id, 3, seed=7, env_kwargs=kwargs)
     assert ours.observation_space == theirs.observation_space

@@ -81,7 +81,7 @@ def test_measuring_does_not_change_the_run(policy: str) -> None:
     assert th.equal(train(None), train(PolicyDiagnosticsCallback(**FREQUENT)))
 
 
-def test_normalised_and_dictionary_observations() -> None:
+def test_normalized_and_dictionary_observations() -> None:
     env = VecNormalize(make_vec_env("TunnelDiagonal-v0", n_envs=3, seed=0))
     SACFlow("FlowPolicy", env, **FAST).learn(200, callback=PolicyDiagnosticsCallback(**FREQUENT))
     multi = SimpleMultiObsEnv(discrete_actions=False, random_start=False)

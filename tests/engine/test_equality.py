@@ -76,7 +76,7 @@ def seed_everything() -> None:
 
 
 def everything(model: SAC) -> dict[str, th.Tensor]:
-    """Parameters, optimiser states and temperature of a model."""
+    """Parameters, optimizer states and entropy coefficient of a model."""
     tensors = {k: v.clone() for k, v in model.policy.state_dict().items()}
     optimizers = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
     if model.ent_coef_optimizer is not None and model.log_ent_coef is not None:

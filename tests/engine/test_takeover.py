@@ -99,7 +99,7 @@ def test_replaced_objects_are_noticed(what: str) -> None:
     elif what == "assign":
         state = {key: value.clone() for key, value in model.policy.state_dict().items()}
         model.policy.load_state_dict(state, assign=True)
-        # What was assigned has no optimiser yet.
+        # What was assigned has no optimizer yet.
         for network in (model.actor, model.critic):
             network.optimizer = th.optim.Adam(network.parameters(), lr=1e-3)
     else:
@@ -191,7 +191,7 @@ def test_released_models_own_their_memory() -> None:
 
 @pytest.mark.parametrize("what", ["moment", "entries", "temperature", "frozen", "part"])
 def test_changes_between_updates_count_as_they_do_in_sb3(what: str) -> None:
-    """The engine and SB3's loop go on alike after somebody reached in."""
+    """The engine and SB3's loop agree after a callback has changed the model."""
 
     def reach_in(model: SAC) -> None:
         states = model.actor.optimizer.state

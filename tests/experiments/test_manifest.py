@@ -59,7 +59,7 @@ def test_hyperparameters_are_those_of_the_zoo() -> None:
     assert default_init.hyperparameters["policy_kwargs"]["distribution_kwargs"]["init"] == "default"
 
 
-def test_variants_of_an_environment_keep_its_vectorised_form() -> None:
+def test_variants_of_an_environment_keep_its_vectorized_form() -> None:
     item = make_plan(find("diagonal-dimensions")).items[-1]
     name = environment(item)
     assert environment(item) == name

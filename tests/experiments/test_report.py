@@ -114,7 +114,7 @@ def test_oscillations_are_what_all_three_curves_do(make_up: MakeUp, tmp_path: Pa
         cells = line.split(",")
         up = int(float(cells[1])) // 6000 % 2
         cells[3], cells[4], cells[7] = str(2.0 * up), str(0.1 + up / 2), str(-4.0 + 2 * up)
-        if int(cells[0]) <= 5:  # the temperature of the other seeds stays where it is
+        if int(cells[0]) <= 5:  # the entropy coefficient of the other seeds stays constant
             cells[8] = str(0.01 * 3**up)
         lines[k] = ",".join(cells)
     path.write_text("\n".join(lines) + "\n")
@@ -130,7 +130,7 @@ def test_outcomes_are_counted_per_agent_and_setting(make_up: MakeUp, tmp_path: P
     assert figure is not None
     texts = [text.get_text() for text in figure.axes[0].texts]
     assert texts.count("10 of 10\n32,000 steps") == 5
-    assert texts.count("0 of 10") == 1  # no steps: nobody ever solved it
+    assert texts.count("0 of 10") == 1  # no steps: no seed solved it
     make_up("circle-fixed-alpha")
     assert outcomes_figure(evidence("circle-fixed-alpha", tmp_path)) is None
 

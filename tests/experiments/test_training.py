@@ -70,7 +70,7 @@ def test_everything_is_measured(item: WorkItem, tmp_path: Path) -> None:
 
 
 class Crash(BaseException):
-    """Not an error that anybody would catch."""
+    """An error that no handler catches."""
 
 
 GSDE = {"policy": "GaussPolicy", "use_sde": True, "train_freq": 8, "gradient_steps": 8}

@@ -158,7 +158,7 @@ def test_the_file_says_what_it_is(tmp_path: Path) -> None:
     assert json.loads(facts["action_space"])["high"] == [[1, 2, 3], [4, 5, 6]]
     assert json.loads(facts["noise"])["shape"] == ["batch", 6]
     assert json.loads(facts["made_with"])["torch"] == th.__version__
-    # Where the exporter found each operation is nobody's business.
+    # Where the exporter found each operation does not matter.
     assert b"site-packages" not in path.read_bytes()
     assert b".py" not in path.read_bytes()
 

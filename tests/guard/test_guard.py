@@ -246,7 +246,7 @@ def test_the_update_and_the_row_are_named() -> None:
 
 @pytest.mark.parametrize("where", ["parameter", "moment", "temperature"])
 def test_learn_does_not_end_with_a_hidden_infinity(where: str) -> None:
-    """Neither a relu's dead unit nor a dead optimiser shows in any loss."""
+    """Neither a relu's dead unit nor a dead optimizer shows in any loss."""
     model = trained(learning_starts=1000)  # no updates: nothing but the guard would notice
     if where == "parameter":
         model.critic.qf0[0].bias.data[3] = -np.inf
@@ -334,7 +334,7 @@ def test_demonstrations_must_fit_into_float32() -> None:
 
 
 def test_logger_of_a_run_without_updates_is_not_looked_at() -> None:
-    """SB3's loop records nothing of a temperature that is fixed."""
+    """SB3's loop records nothing of a fixed entropy coefficient."""
     kwargs = {"net_arch": [8], "optimizer_class": th.optim.SGD}
     env = make_vec_env("Pendulum-v1")
     model = SACFlow("GaussPolicy", env, ent_coef=0.1, **{**SEEDED, "policy_kwargs": kwargs})

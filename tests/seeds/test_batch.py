@@ -113,7 +113,7 @@ def test_training_on_does_not_repeat_the_same_episodes() -> None:
     assert not np.array_equal(*starts)
 
 
-def test_environments_without_a_vectorised_form() -> None:
+def test_environments_without_a_vectorized_form() -> None:
     batch = SeedBatch("GaussPolicy", lambda: IdentityEnvBox(eps=0.5), 2, **FAST).learn(60)
     assert all(np.isfinite(vector(model)).all() for model in batch.models)
 
@@ -310,7 +310,7 @@ def test_info_keywords_are_noted_as_monitor_does(tmp_path: Path) -> None:
     ]
     assert len(noted) >= 4
     assert sorted(noted) == pytest.approx(sorted(load_results(str(tmp_path))["x_max"]))
-    # Nobody starts exactly in the middle.
+    # No episode starts exactly in the middle.
     assert min(noted) > 0
 
 
