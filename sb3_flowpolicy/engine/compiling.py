@@ -82,7 +82,7 @@ def _options(device: th.device) -> dict[str, Any]:
     th._dynamo.config.trace_autograd_ops  # noqa: B018 (new in torch 2.11)
     return {
         # Dynamo would check at each call that modules and shapes are those it compiled for, which
-        # takes as long as the update of a small network. Here the caller tells them apart: see __call__.
+        # takes as long as the update of a small network. Here the caller does so: see __call__.
         "guard_filter_fn": th.compiler.skip_all_guards_unsafe,
         # Inductor would leave loops over two or three action dimensions scalar: exp, tanh and
         # log1p then cost as much as all products of a small network together.
