@@ -46,8 +46,7 @@ def imports(path: Path) -> set[str]:
 
 
 def files(floor: str) -> list[Path]:
-    package = ROOT / "sb3_flowpolicy" / floor
-    return sorted(package.rglob("*.py")) if package.is_dir() else [package.with_suffix(".py")]
+    return sorted((ROOT / "sb3_flowpolicy" / floor).rglob("*.py"))
 
 
 @pytest.mark.parametrize("floor", FLOORS)

@@ -23,8 +23,8 @@ _NORMALIZATION = {
 class CrossQFlow(OffPolicyFlow, CrossQ):
     """CrossQ with action distributions that correlate and bend.
 
-    Everything of sb3-contrib's :class:`~sb3_contrib.CrossQ` holds, and what
-    :class:`~sb3_flowpolicy.TQCFlow` adds. Like CrossQ it takes vectors as observations, no images
+    Supports everything that sb3-contrib's :class:`~sb3_contrib.CrossQ` does, with the additions of
+    :class:`~sb3_flowpolicy.TQCFlow`. Like CrossQ it takes vectors as observations, no images
     or dictionaries.
 
     Args:
@@ -32,7 +32,8 @@ class CrossQFlow(OffPolicyFlow, CrossQ):
             policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of CrossQ, in its order.
-        **kwargs: Keyword arguments of CrossQ, and the two of exploration.
+        **kwargs: Keyword arguments of CrossQ, ``action_noise_color`` and
+            ``action_noise_correlation_time``.
 
     Raises:
         ValueError: If an argument is out of range.

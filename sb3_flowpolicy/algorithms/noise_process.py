@@ -20,7 +20,7 @@ class NoiseProcess:
 
     Every value on its own is exactly standard normal, from the first step of an episode on. So at
     a fixed state a density that is handed this noise has the distribution it always has, while
-    successive actions correlate: the agent moves somewhere instead of trembling on the spot.
+    successive actions correlate: the agent moves somewhere instead of jittering in place.
 
     The process is a weighted sum of first-order autoregressions with correlation times from half a
     step to sixteen horizons. Unlike noise that is made in the frequency domain it needs no length

@@ -64,7 +64,7 @@ SETTINGS: dict[str, Check] = {
     "action_noise_color": number(0, MAX_COLOR),
     "action_noise_correlation_time": optional(number(0, above=True)),
 }
-"""Arguments of an off-policy algorithm that are plain values, and what they may be."""
+"""Arguments of an off-policy algorithm that are plain values, with their checks."""
 
 # What SB3 logs of an update. The critics come first: losses are means over several updates, which
 # do not tell which loss was the first to fail.
@@ -99,7 +99,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
     policy_class_of_stock: ClassVar[type[BasePolicy]]
     """Base class of its policies."""
     settings: ClassVar[Mapping[str, Check]] = SETTINGS
-    """Arguments of the constructor that are plain values, and what they may be."""
+    """Arguments of the constructor that are plain values, with their checks."""
 
     def __init__(
         self,
@@ -195,11 +195,11 @@ class OffPolicyFlow(OffPolicyAlgorithm):
         return self
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Do ``gradient_steps`` updates of the algorithm's own.
+        """Run ``gradient_steps`` updates of the stock algorithm.
 
         Raises:
-            NonFiniteError: If a loss is not finite; weights are then as they were at most 2000
-                updates before.
+            NonFiniteError: If a loss is not finite; weights are then as they were when the guard
+                last checked them.
         """
         if gradient_steps == 0:  # SB3 would log NaN, the mean of an empty list
             return

@@ -44,7 +44,7 @@ _SETTINGS: dict[str, Check] = {
 class PPOFlow(PPO):
     """Proximal Policy Optimization with action distributions that correlate and bend.
 
-    SB3's :class:`~stable_baselines3.PPO`, which knows more policies by name.
+    SB3's :class:`~stable_baselines3.PPO` with additional policy aliases.
 
     Args:
         policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, their ``Cnn...`` and

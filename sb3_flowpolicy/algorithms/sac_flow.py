@@ -224,10 +224,7 @@ class SACFlow(OffPolicyFlow, SAC):
             self.add_demonstrations(self._demonstrations)
             self._demonstrations = None
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        # Many short calls of learn(), with tests in between, repay compiling as a long one does. A
-        # resumed call was counted when it began.
-        if not self._checkpoints.resuming:
-            self._runtime.planned += self._planned_updates(total_timesteps)
+        self._runtime.plan(self._planned_updates(total_timesteps))
         return total_timesteps, callback
 
     def _sample_action(
@@ -254,9 +251,11 @@ class SACFlow(OffPolicyFlow, SAC):
         observations, optimizers other than Adam, ...) use SB3's own loop.
 
         Raises:
-            NonFiniteError: If a loss is not finite; weights are then as they were at most 2000
-                updates before.
+            NonFiniteError: If a loss is not finite; weights are then as they were when the guard
+                last checked them.
         """
+        if gradient_steps == 0:
+            return
         with self._runtime.running():
             engine = self._runtime.engine()
             if engine is None:

@@ -16,8 +16,8 @@ from sb3_flowpolicy.policies import tqc
 class TQCFlow(OffPolicyFlow, TQC):
     """Truncated Quantile Critics with action distributions that correlate and bend.
 
-    Everything of sb3-contrib's :class:`~sb3_contrib.TQC` holds. ``action_noise_color`` and
-    ``action_noise_correlation_time`` make exploration directed, see
+    Supports everything that sb3-contrib's :class:`~sb3_contrib.TQC` does.
+    ``action_noise_color`` and ``action_noise_correlation_time`` make exploration directed, see
     :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`; :meth:`learn` takes
     ``checkpoint_every`` and ``checkpoint_path``. Updates are sb3-contrib's own: only
     :class:`~sb3_flowpolicy.SACFlow` uses the fast engine.
@@ -27,7 +27,8 @@ class TQCFlow(OffPolicyFlow, TQC):
             their ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of TQC, in its order.
-        **kwargs: Keyword arguments of TQC, and the two of exploration.
+        **kwargs: Keyword arguments of TQC, ``action_noise_color`` and
+            ``action_noise_correlation_time``.
 
     Raises:
         ValueError: If an argument is out of range.

@@ -35,7 +35,7 @@ class RunCheckpoints:
 
     def __init__(self, describe: Callable[[], Run]) -> None:
         self._describe = describe
-        #: Folder of the checkpoints, None before any were asked for.
+        #: Folder of the checkpoints, None until some are requested.
         self.path: Path | None = None
         #: Whether checkpoints are being written.
         self.active = False
@@ -80,7 +80,7 @@ class RunCheckpoints:
                 self.start(path, every)
             yield
             if self._late is not None:
-                # This call had ended before the run was interrupted, which its logs are to show;
+                # This call had ended before the run was interrupted, and its logs must show that;
                 # the next call is the one to resume.
                 self._begun = self._run().first._total_timesteps
                 state.restore_late(self._run(), self._late)
@@ -97,7 +97,7 @@ class RunCheckpoints:
     def start(self, path: str | Path, every: int) -> None:
         """Begin to write checkpoints, until :meth:`stop`.
 
-        The first checkpoint of a new run is due at once, so that what cannot be saved shows early.
+        The first checkpoint of a new run is due at once, to report early what cannot be saved.
 
         Raises:
             ValueError: As :meth:`learning`.
@@ -123,6 +123,7 @@ class RunCheckpoints:
                         "folder"
                     )
                 self._store, self._rows, self._last = store, RowFiles(), None
+                self._resumed_from = None
             self.path = path
         self._every, self.active = every, True
         self._signals.watch()
@@ -154,7 +155,10 @@ class RunCheckpoints:
             Whether to go on: False after SIGTERM and Ctrl-C.
         """
         if self._late is not None:
-            state.restore_late(self._run(callbacks), self._late)
+            run = self._run(callbacks)
+            state.restore_late(run, self._late)
+            for agent in run.agents.values():  # not where a call before this one began
+                agent._num_timesteps_at_start = self._begun
             self._late = None
             self.opaque.clear()
         if not self.active:
@@ -226,7 +230,11 @@ class RunCheckpoints:
             facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
             return {"segments": segments.to_json(files), **facts}
 
-        self._store.write(now, _facts(run), write_files)
+        try:
+            self._store.write(now, _facts(run), write_files)
+        except BaseException:
+            self._rows = RowFiles()  # the next checkpoint writes all rows again
+            raise
         self._last = now
 
 

@@ -23,6 +23,7 @@ class StopSignals:
 
     def watch(self) -> None:
         """Note signals from now on, except those that the process ignores."""
+        self.received = None
         if threading.current_thread() is not threading.main_thread():
             return
         for number in _WATCHED:

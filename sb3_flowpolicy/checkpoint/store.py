@@ -45,7 +45,7 @@ class CheckpointStore:
     """The checkpoints of one run.
 
     A checkpoint is a folder ``00007-step-70000``. Its files and the rows that are new since the one
-    before are written and synchronised under other names first; renaming the folder completes it. A
+    before are written and synchronized under other names first; renaming the folder completes it. A
     manifest lists the SHA-256 of every file, those of earlier rows included.
 
     Args:

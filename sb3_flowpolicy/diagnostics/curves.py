@@ -1,4 +1,4 @@
-"""`python -m sb3_flowpolicy.diagnostics.curves`: draw test returns written by train_seeds."""
+"""`python -m sb3_flowpolicy.diagnostics.curves`: draw the test returns of seeds."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.diagnostics.curves",
-        description="Draw the test returns in files written by train_seeds --eval-freq.",
+        description="Draw the test returns in files written by sb3_flowpolicy.seeds --eval-freq.",
     )
     parser.add_argument("files", nargs="+", metavar="name=file.csv", help="agents and their files")
     parser.add_argument("-o", "--output", type=Path, required=True, help="picture to write")

@@ -17,8 +17,8 @@ class EngineRuntime:
     """The engine of models that learn together.
 
     Between :meth:`running` and its end the models' parameters and optimizer states are views of the
-    engine's tensors. Callbacks may load, reset or replace anything meanwhile, so with callbacks the
-    binding is checked before every use; without any, once.
+    engine's tensors. Callbacks may load parameters, reset optimizers, replace networks or change
+    settings meanwhile, so with callbacks the binding is checked before every use; else once.
 
     Args:
         models: SACFlow models that differ only in weights, data and random numbers. Their
@@ -28,8 +28,9 @@ class EngineRuntime:
 
     def __init__(self, models: Sequence[Any], refuse: Callable[[str], None]) -> None:
         self.models = models
-        #: Updates that all calls of ``learn`` together have planned.
-        self.planned = 0.0
+        # Number of updates of the models before their first call of ``learn``, and after this one.
+        self._first: int | None = None
+        self._last = 0.0
         self._refuse = refuse
         self._engine: Engine | None = None
         self._running = self._checked = self._refused = False
@@ -44,7 +45,20 @@ class EngineRuntime:
     def compiles(self) -> bool:
         """Whether the models' settings, and the number of planned updates, ask for compiling."""
         wanted = self.models[0].compile
-        return self.planned >= UPDATES_WORTH_COMPILING if wanted == "auto" else bool(wanted)
+        if wanted != "auto":
+            return bool(wanted)
+        # Many short calls of ``learn``, with tests in between, repay compiling as a long one does.
+        return self._last - (self._first or 0) >= UPDATES_WORTH_COMPILING
+
+    def plan(self, updates: float) -> None:
+        """Note that a call of ``learn`` begins.
+
+        Args:
+            updates: Number of updates that it is going to do.
+        """
+        done = self.models[0]._n_updates
+        self._first = done if self._first is None else self._first
+        self._last = done + updates
 
     @contextmanager
     def running(self, watched: bool = True) -> Iterator[None]:
@@ -111,10 +125,10 @@ class EngineRuntime:
             self._engine.release()
             self._engine = None
 
-    def state(self) -> dict[str, float]:
+    def state(self) -> dict[str, int | None]:
         """Return what a checkpoint stores."""
-        return {"planned": self.planned}
+        return {"first": self._first}
 
-    def load_state(self, state: dict[str, float]) -> None:
+    def load_state(self, state: dict[str, int | None]) -> None:
         """Restore what :meth:`state` returned."""
-        self.planned = state["planned"]
+        self._first = state["first"]

@@ -106,10 +106,6 @@ def facts(evidence: Evidence) -> dict[str, str]:
         return found
     found["seeds"] = f"{seeds[0]} to {seeds[-1]}, {steps:,} steps each"
     found["items"] = f"{len(done)} of {len(evidence.items)} finished"
-    shared = sorted({one["adopted_from"].split("/")[0] for one in done if "adopted_from" in one})
-    if shared:
-        count = sum("adopted_from" in one for one in done)
-        found["items"] += f", {count} of them in {', '.join(shared)}, which shares them"
     if done:
         machine = done[-1]["machine"]
         hours = sum(one["cpu_seconds"] for one in done) / 3600

@@ -31,10 +31,10 @@ class Minibatch(Protocol):
 class TrainingGuard:
     """Checks losses, parameters and optimizers of S agents that are trained in lockstep.
 
-    Every 2000th update it checks that all parameters and optimizer states are finite, and copies
-    them. After every call of ``train()`` it checks the losses. If anything is not finite, it
-    restores the copies in all agents and raises :class:`NonFiniteError`: the agents are as they
-    were at most 2000 updates before, and can be used and saved.
+    Before a call of ``train()``, if 2000 updates have passed since it last did so, it checks that
+    all parameters and optimizer states are finite, and copies them. After every call it checks the
+    losses. If anything is not finite, it restores the copies in all agents and raises
+    :class:`NonFiniteError`: the agents can be used and saved.
 
     Args:
         models: The agents, which have done equally many updates. Besides SB3's attributes they

@@ -43,7 +43,8 @@ def main(arguments: list[str] | None = None) -> None:
     else:
         batch = _new_batch(args, folder)
     total = args.n_timesteps or load_hyperparameters(args.algo, args.env)["n_timesteps"]
-    every = args.eval_freq or total
+    evaluates = args.eval_freq is not None and args.eval_freq > 0
+    every = args.eval_freq if evaluates else total
     done, first = batch.models[0].num_timesteps, True
     end = min(max(1, math.ceil(done / every)) * every, total)
     left = max(0, total - done)
@@ -61,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
             done, first = batch.models[0].num_timesteps, False
         returns = _test_returns(batch, args.env, args.eval_episodes)
-        if args.eval_freq:
+        if evaluates:
             _record(folder / "evaluations.csv", batch.seeds, done, returns)
             print(f"  step {done:<8} test return {np.mean(returns):8.2f}", flush=True)
         if end >= total:

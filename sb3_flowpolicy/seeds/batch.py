@@ -236,9 +236,7 @@ class SeedBatch:
         check_stackable(first)
         if any(_shared_settings(model) != _shared_settings(first) for model in self._models):
             raise ValueError("agents must all have the same settings, got different ones")
-        # A resumed call of learn() was counted when it began.
-        if not self._checkpoints.resuming:
-            self._runtime.planned = first._runtime.planned
+        self._runtime.plan(first._planned_updates(first._total_timesteps))
         self._guard.restart(self._checkpoints.path)
         self._experience.fit()
 

@@ -1,4 +1,4 @@
-"""Load models that `rl_zoo3.train` or `train_seeds` saved, with their environments."""
+"""Load models that `rl_zoo3.train` or `sb3_flowpolicy.seeds` saved, with their environments."""
 
 import argparse
 from pathlib import Path

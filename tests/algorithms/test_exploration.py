@@ -163,7 +163,7 @@ def test_a_resumed_run_is_the_undisturbed_one(kind: str, tmp_path: Path) -> None
     expected = state(new().learn(80))
     path = tmp_path / "checkpoints"
     new().learn(45, checkpoint_every=15, checkpoint_path=path)
-    # The last one is that of the end; its run had planned less, which changes no number here.
+    # The last checkpoint is that of the end.
     if kind == "agent":
         run = SACFlow.resume(path, make_vec_env("TunnelDiagonal-v0", 1))
     else:

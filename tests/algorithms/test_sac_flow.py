@@ -237,7 +237,7 @@ def test_demonstrations_may_be_a_recipe() -> None:
 
 
 def test_auto_compiles_once_all_calls_of_learn_together_repay_it(
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
 
@@ -252,4 +252,12 @@ def test_auto_compiles_once_all_calls_of_learn_together_repay_it(
     model.learn(40)  # 30 updates
     assert not any(asked)
     model.learn(30, reset_num_timesteps=False)  # and 30 more
+    assert asked[-1]
+    # A resumed program, whose first call had ended, does the same.
+    settings: Any = {"checkpoint_every": 100, "checkpoint_path": tmp_path}
+    asked.clear()
+    SACFlow("GaussPolicy", "Pendulum-v1", learning_starts=10, batch_size=8).learn(40, **settings)
+    resumed = SACFlow.resume(tmp_path, "Pendulum-v1").learn(40, **settings)
+    assert not any(asked)
+    resumed.learn(30, reset_num_timesteps=False, **settings)
     assert asked[-1]

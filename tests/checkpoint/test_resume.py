@@ -275,6 +275,40 @@ def test_several_calls_of_learn(tmp_path: Path) -> None:
         assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
 
 
+def test_a_second_call_that_breaks_twice_keeps_its_end(tmp_path: Path) -> None:
+    """Its checkpoints say where it began itself, not where the call before it did."""
+    checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": tmp_path}
+    SACFlow("FlowPolicy", ENV, **FAST).learn(60, **checkpoints)
+    model = SACFlow.resume(tmp_path, ENV).learn(60, **checkpoints)
+    with pytest.raises(BrokenError):
+        model.learn(50, callback=BreakAt(93), reset_num_timesteps=False, **checkpoints)
+    resumed = SACFlow.resume(tmp_path, ENV)
+    assert resumed.num_timesteps == 80
+    assert resumed.learn(50, reset_num_timesteps=False, **checkpoints).num_timesteps == 110
+
+
+def test_a_run_goes_on_after_a_checkpoint_that_could_not_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": tmp_path}
+    model = SACFlow("FlowPolicy", ENV, **FAST)
+    rename, calls = Path.rename, []
+
+    def fail_once(path: Path, target: Path) -> Path:
+        calls.append(path)
+        if len(calls) == 3:
+            raise OSError("no space left on device")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", fail_once)
+    with pytest.raises(OSError, match="no space left"):
+        model.learn(80, **checkpoints)
+    model.learn(80, **checkpoints, reset_num_timesteps=False)
+    resumed = SACFlow.resume(tmp_path, ENV)
+    left, right = _state(model), _state(resumed)
+    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+
+
 class Locked(gym.Wrapper):
     """Holds something that cannot be pickled."""
 

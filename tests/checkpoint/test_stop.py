@@ -134,3 +134,18 @@ def test_without_checkpoints_ctrl_c_is_as_ever() -> None:
     with pytest.raises(KeyboardInterrupt):
         model.learn(80, callback=SignalAt(signal.SIGINT))
     assert model.num_timesteps == 33
+
+
+def test_an_exception_takes_the_place_of_a_signal(tmp_path: Path) -> None:
+    class Fails(SignalAt):
+        def _on_step(self) -> bool:
+            super()._on_step()
+            if self.num_timesteps == 33:
+                raise KeyError("the program's own")
+            return True
+
+    model = SACFlow("FlowPolicy", ENV, **FAST)
+    checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": tmp_path}
+    with pytest.raises(KeyError):
+        model.learn(80, callback=Fails(signal.SIGTERM), **checkpoints)
+    assert model.learn(20, reset_num_timesteps=False, **checkpoints).num_timesteps == 53

@@ -150,9 +150,7 @@ def test_logs_and_monitors_are_per_seed(tmp_path: Path) -> None:
     episodes = sum(model._episode_num for model in batch.models)
     assert len(results) == episodes
     assert results["l"].sum() <= 240
-    log = batch.models[0].logger.name_to_value
     assert batch.models[0].ep_success_buffer is not None
-    assert {"train/critic_loss", "train/actor_loss", "train/learning_rate"} <= set(log) or not log
 
 
 class Crash(BaseCallback):
