@@ -19,7 +19,7 @@ import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import NonFiniteError, SACFlow
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.common.validation import number
-from tests.algorithms.test_contrib import BreakAt, BrokenError
+from tests.checkpoint.test_resume import BreakAt, BrokenError
 from tests.guard.test_guard import Faulty
 
 ENV = "TunnelDiagonal-v0"

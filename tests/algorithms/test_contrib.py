@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch as th
 from sb3_contrib import TQC, CrossQ
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, FlowActorCriticPolicy, FlowPolicy, PPOFlow, SACFlow, TQCFlow
 from sb3_flowpolicy.diagnostics import PolicyDiagnosticsCallback
+from tests.checkpoint.test_resume import BreakAt, BrokenError
 
 ENV = "TunnelDiagonal-v0"
 OFF_POLICY: Any = pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
@@ -24,21 +24,6 @@ def make(algorithm: Any, policy: str = "FlowPolicy", **kwargs: Any) -> Any:
     settings = {"learning_starts": 20, "batch_size": 16, "buffer_size": 300, "seed": 0}
     settings |= {"policy_kwargs": {"net_arch": [16, 16]}, "device": "cpu"} | kwargs
     return algorithm(policy, ENV, **settings)
-
-
-class BrokenError(Exception):
-    """What a run dies of here."""
-
-
-class BreakAt(BaseCallback):
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= self.step:
-            raise BrokenError
-        return True
 
 
 @OFF_POLICY
