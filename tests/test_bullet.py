@@ -19,11 +19,12 @@ with warnings.catch_warnings():
 def test_ant_trains_without_nan(algo: str) -> None:
     settings = load_hyperparameters(algo, "AntBulletEnv-v0")
     del settings["n_timesteps"]
-    # Fewer random steps than in the thesis's table, so that the policy itself acts in the test.
-    settings.update(buffer_size=3000, random_steps=2200, seed=0, device="cpu")
-    model = SACFlow(env="AntBulletEnv-v0", **settings).learn(3000)
-    assert model._n_updates >= 768
+    # Shorter than in the thesis's table, so that the policy itself soon learns and acts.
+    settings.update(buffer_size=700, learning_starts=300, random_steps=400, seed=0, device="cpu")
+    settings.update(train_freq=32, gradient_steps=8)
+    model = SACFlow(env="AntBulletEnv-v0", **settings).learn(700)
+    assert model._n_updates >= 96
     assert np.isfinite(model.policy.parameters_to_vector()).all()
     assert model.replay_buffer is not None
-    assert np.isfinite(model.replay_buffer.observations[:3000]).all()
-    assert np.isfinite(model.replay_buffer.actions[:3000]).all()
+    assert np.isfinite(model.replay_buffer.observations).all()
+    assert np.isfinite(model.replay_buffer.actions).all()

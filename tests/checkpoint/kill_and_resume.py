@@ -9,13 +9,14 @@ replay buffers and logs bit for bit; only the columns of wall-clock time are lef
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
+import multiprocessing
 import os
 import random
-import subprocess
-import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ AGENTS = ("SACFlow", "SeedBatch")
 ENGINES = ("eager", "compiled")
 SEEDS = 3
 _TIMES = {"time/fps", "time/time_elapsed", "t"}
+# New processes are forked from one that has imported everything, and so start at once.
+_CONTEXT = multiprocessing.get_context("forkserver")
+_PRELOADED = ["stable_baselines3", "sb3_flowpolicy.seeds", "flowpolicy_envs", __name__]
 
 
 def main() -> int:
@@ -34,13 +38,9 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=4000, help="environment steps of a run")
     parser.add_argument("--every", type=int, default=100, help="steps between checkpoints")
     parser.add_argument("--seed", type=int, default=0, help="decides when to kill")
-    parser.add_argument("--train", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    agents, engines = arguments.agents, arguments.engines
-    if arguments.train is not None:
-        train(agents[0], engines[0], arguments.steps, arguments.every, arguments.train)
-        return 0
-    kinds = [(agent, engine) for engine in engines for agent in agents]
+    _CONTEXT.set_forkserver_preload(_PRELOADED)
+    kinds = [(agent, engine) for engine in arguments.engines for agent in arguments.agents]
     moments, rest = divmod(arguments.moments, len(kinds))
     draw = random.Random(arguments.seed)
     unequal = kills = 0
@@ -67,8 +67,26 @@ def main() -> int:
     return int(unequal > 0)
 
 
-def train(agent: str, engine: str, steps: int, every: int, folder: Path, seed: int = 1) -> None:
-    """Train, or go on training, and write what has come out; ``every`` 0: no checkpoints."""
+def train(
+    agent: str,
+    engine: str,
+    steps: int,
+    every: int,
+    folder: Path,
+    seed: int = 1,
+    tell: Callable[[int], None] = lambda step: None,
+) -> None:
+    """Train, or go on training, and write what has come out.
+
+    Args:
+        agent: ``"SACFlow"`` or ``"SeedBatch"``.
+        engine: ``"eager"`` or ``"compiled"``.
+        steps: Environment steps of the whole run.
+        every: Steps between checkpoints; 0 for none.
+        folder: Where checkpoints, logs and the outcome go.
+        seed: Seed of a single agent.
+        tell: Called with the number of steps, every tenth step.
+    """
     import gymnasium as gym
     import torch as th
     from stable_baselines3.common.callbacks import BaseCallback
@@ -80,11 +98,9 @@ def train(agent: str, engine: str, steps: int, every: int, folder: Path, seed: i
     from sb3_flowpolicy.checkpoint import has_checkpoint
 
     class Tell(BaseCallback):
-        """Tells the other process where we are."""
-
         def _on_step(self) -> bool:
             if self.num_timesteps % 10 == 0:
-                print(self.num_timesteps, flush=True)
+                tell(self.num_timesteps)
             return True
 
     th.set_num_threads(1)
@@ -177,16 +193,30 @@ def _rows(path: Path) -> list[dict[str, str]]:
     ]
 
 
-def _command(agent: str, engine: str, steps: int, every: int, folder: Path) -> list[str]:
-    options = {"--steps": steps, "--every": every, "--agents": agent, "--engines": engine}
-    words = [str(word) for pair in options.items() for word in pair]
-    return [sys.executable, __file__, *words, "--train", str(folder)]
+def _in_a_process(reports: Any, *arguments: Any) -> None:
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(null, stream)
+    train(*arguments, tell=reports.send)
+
+
+def _start(*arguments: Any) -> tuple[Any, Any]:
+    """Begin to train; return the process and the connection on which it tells its steps."""
+    reports, theirs = _CONTEXT.Pipe(duplex=False)
+    process = _CONTEXT.Process(target=_in_a_process, args=(theirs, *arguments))
+    process.start()
+    theirs.close()
+    return process, reports
 
 
 def _run(agent: str, engine: str, steps: int, every: int, folder: Path) -> None:
     folder.mkdir(exist_ok=True)
-    command = _command(agent, engine, steps, every, folder)
-    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
+    process, reports = _start(agent, engine, steps, every, folder)
+    with reports:
+        _wait_for(reports, steps + 1)
+    process.join()
+    if process.exitcode != 0:
+        raise RuntimeError(f"training was to end with 0, but ended with {process.exitcode}")
 
 
 def _kill(
@@ -194,20 +224,23 @@ def _kill(
 ) -> bool:
     """Train until ``step``, and a little longer, then kill; whether a checkpoint was torn."""
     folder.mkdir(exist_ok=True)
-    command = _command(agent, engine, steps, every, folder)
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if int(line) >= step:
-                # Some moments fall into the writing of a checkpoint, which takes that long.
-                time.sleep(draw.uniform(0, 0.1))
-                break
+    process, reports = _start(agent, engine, steps, every, folder)
+    with reports:
+        _wait_for(reports, step)
+        # Some moments fall into the writing of a checkpoint, which takes that long.
+        time.sleep(draw.uniform(0, 0.1))
         process.kill()
-    if process.returncode != -9:
-        raise RuntimeError(f"training was to be killed, but ended with {process.returncode}")
+    process.join()
+    if process.exitcode != -9:
+        raise RuntimeError(f"training was to be killed, but ended with {process.exitcode}")
     return any(name.startswith(".partial") for name in os.listdir(folder / "checkpoints"))
+
+
+def _wait_for(reports: Any, step: int) -> None:
+    """Return when training has reached ``step`` or ended."""
+    with contextlib.suppress(EOFError):
+        while reports.recv() < step:
+            pass
 
 
 if __name__ == "__main__":

@@ -223,13 +223,15 @@ def test_who_learns_nothing_is_not_steady(make_up: MakeUp, tmp_path: Path) -> No
     assert "0 of 10 ever succeed in training" in findings[2].measured
 
 
-def test_a_renamed_folder_and_strangers_are_left_alone(tiny: Experiment, tmp_path: Path) -> None:
+def test_a_renamed_folder_and_strangers_are_left_alone(
+    tiny: Experiment, make_up: MakeUp, tmp_path: Path
+) -> None:
     """Beside the experiment's folder, whatever else lies there."""
     (tmp_path / ".vscode").mkdir()
     (tmp_path / ".vscode" / "settings.json").write_text('{"editor.fontSize": // comment\n 12}')
-    command = ["run", "tiny", "--out", str(tmp_path), "--workers", "1", "--no-progress"]
-    assert main(command) == 0
+    make_up("tiny", seeds=2)
     (tmp_path / "tiny").rename(tmp_path / "mine")
-    assert main(command) == 0
+    make_up("tiny", seeds=2)
+    assert main(["run", "tiny", "--out", str(tmp_path), "--no-progress"]) == 0
     shutil.copytree(tmp_path / "mine", tmp_path / NAME)
     assert main(["report", "--results", str(tmp_path)]) == 1

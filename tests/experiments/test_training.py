@@ -76,9 +76,9 @@ class Crash(BaseException):
 GSDE = {"policy": "GaussPolicy", "use_sde": True, "train_freq": 8, "gradient_steps": 8}
 
 
-@pytest.mark.parametrize("every", [20, 40])
 @pytest.mark.parametrize(
-    ("crashes", "overrides"), [([0, 3], {}), ([1, 3, 1, 2], {}), ([1, 2, 3, 4], GSDE)]
+    ("crashes", "overrides", "every"),
+    [([0, 3], {}, 20), ([1, 3, 1, 2], {}, 40), ([1, 2, 3, 4], GSDE, 20)],
 )
 def test_interrupted_runs_end_with_the_same_results(
     crashes: list[int], overrides: dict[str, Any], every: int, item: WorkItem, tmp_path: Path

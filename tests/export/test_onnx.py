@@ -79,7 +79,10 @@ def run(path: Path, outputs: list[str], feed: dict[str, np.ndarray]) -> list[np.
 @pytest.mark.parametrize(
     ("kind", "form"),
     [
-        *((kind, form) for kind in ("Gauss", "LowRank", "Flow") for form in ("", "MultiInput")),
+        ("Gauss", ""),
+        ("LowRank", ""),
+        ("Flow", ""),
+        ("Flow", "MultiInput"),
         # Densities that have no policy class of their own.
         ("lattice", ""),
         ("spline", ""),
@@ -88,7 +91,10 @@ def run(path: Path, outputs: list[str], feed: dict[str, np.ndarray]) -> list[np.
 def test_actions_are_those_of_predict(kind: str, form: str, tmp_path: Path) -> None:
     """Deterministic actions, and samples given the noise that torch draws, of 1000 observations."""
     if kind in registered_distributions():
-        model = trained("FlowPolicy", policy_kwargs={**NET, "distribution": kind})
+        policy_kwargs = {**NET, "distribution": kind}
+        if kind == "spline":
+            policy_kwargs["distribution_kwargs"] = {"layers": 2}  # exporting a layer takes long
+        model = trained("FlowPolicy", policy_kwargs=policy_kwargs)
     else:
         model = trained(f"{form}{kind}Policy")
     path = export_onnx(model, tmp_path / "policy", stochastic=True)
@@ -207,11 +213,11 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("options", [[], ["--sample"]])
-def test_the_example_runs_without_torch(options: list[str], tmp_path: Path) -> None:
+def test_the_example_runs_without_torch(tmp_path: Path) -> None:
     example = Path(__file__).parents[2] / "docs" / "examples" / "run_onnx.py"
     model = SACFlow("GaussPolicy", "TunnelDiagonal-v0", policy_kwargs=NET, **FAST)
-    path = export_onnx(model, tmp_path / "tunnel", stochastic=bool(options))
+    path = export_onnx(model, tmp_path / "tunnel", stochastic=True)
     command = [sys.executable, "-c", WITHOUT_TORCH, str(example), str(path), "--episodes", "2"]
-    result = subprocess.run([*command, *options], capture_output=True, text=True, check=True)
-    assert "TunnelDiagonal-v0: success" in result.stdout
+    for options in ([], ["--sample"]):
+        result = subprocess.run([*command, *options], capture_output=True, text=True, check=True)
+        assert "TunnelDiagonal-v0: success" in result.stdout

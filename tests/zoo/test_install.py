@@ -130,23 +130,19 @@ def test_train_then_enjoy_then_record_video(installed):
     assert list((installed.work / "logs").rglob("*.mp4"))
 
 
-def test_the_users_file_wins(installed):
-    mine = installed.work / "mine.yml"
-    mine.write_text("default: {policy: LowRankPolicy, n_timesteps: 20, buffer_size: 77}\n")
-    arguments = ("--algo", "sac_gauss", *ENV, "--eval-freq", "-1", "-conf", "mine.yml")
-    shown = zoo(installed, "train", *arguments)
-    assert "Loading hyperparameters from: mine.yml" in shown
-    assert "('buffer_size', 77)" in shown
-
-
-def test_optimize_then_train_with_a_trial(installed):
+def test_optimize_then_train_with_a_trial_and_a_file_of_ones_own(installed):
     study = ("--storage", "study.log", "--study-name", "ranks")
     tune = ("--optimize", "--n-trials", "2", "--no-optim-plots")
     quick = ("--n-evaluations", "1", *BRIEF, *EARLY)
     shown = zoo(installed, "train", "--algo", "sac_lowrank", *tune, *study, *quick)
     assert "Number of finished trials:  2" in shown
-    chosen = ("--trial-id", "1", *study, *BRIEF)
+    mine = installed.work / "mine.yml"
+    settings = "policy: LowRankPolicy, n_timesteps: 20, target_update_interval: 3"
+    mine.write_text(f"default: {{{settings}}}\n")
+    chosen = (*ENV, "--eval-freq", "-1", "--trial-id", "1", *study, "-conf", "mine.yml")
     shown = zoo(installed, "train", "--algo", "sac_lowrank", *chosen)
+    assert "Loading hyperparameters from: mine.yml" in shown
+    assert "('target_update_interval', 3)" in shown
     assert "'rank': " in shown
     assert "'weight_decay': 2.5e-05" in shown
 
