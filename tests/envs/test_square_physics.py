@@ -29,9 +29,12 @@ class World:
         kernels.simulate(
             self.dt,
             1,
+            0,
+            True,
             self.constants,
             PLACES,
             self.targets,
+            np.zeros((2, 4, 2)),
             self.body,
             self.fingers,
             *self._rest,

@@ -1,6 +1,6 @@
 """The state of N Squares, with reset and step."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,22 @@ from flowpolicy_envs.square.tasks import as_task
 
 METRICS = ("held_fraction", "x_std", "x_max", "distance_std", "distance_max")
 END_REASONS = np.array(["timeout", "dropped", "broken"], dtype=object)
+
+
+class RollOut(NamedTuple):
+    """T steps of N worlds, arrays of shape (T, N).
+
+    Attributes:
+        taken: Whether the world was still running.
+        failed: Whether this step ended the episode.
+        rewards: Zero after the end.
+        log_slopes: Sum over the components of log(1 - a^2): what tanh adds to the entropy.
+    """
+
+    taken: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
+    rewards: NDArray[np.float64]
+    log_slopes: NDArray[np.float64]
 
 
 class SquareBatch:
@@ -95,9 +111,12 @@ class SquareBatch:
         self._rules = (
             float(config.dt),
             int(config.substeps),
+            int(config.slew_substeps),
+            bool(config.friction_cone),
             float(config.warm_steps),
             as_task(config.task).terms(),
             self.goals,
+            np.zeros((2, kernels.FINGERS, 2)),
             np.zeros(kernels.SCRATCH),
             np.zeros((kernels.FINGERS, 4)),
             self.rewards,
@@ -145,6 +164,27 @@ class SquareBatch:
         culprit = kernels.step_batch(self._requests, moving, *self._rules, *self._seen)
         if culprit >= 0:
             raise ValueError(f"actions must not contain NaN, got {given[culprit]} at {culprit}")
+
+    def roll_out(self, means: ArrayLike, noise: NDArray[np.float64]) -> RollOut:
+        """Run all worlds to their end under a squashed normal policy, compiled as a whole.
+
+        The actions are tanh(`means` + `noise`). Observations get no noise.
+
+        Args:
+            means: (8,).
+            noise: (T, N, 8) for T steps.
+
+        Returns:
+            What happened. The metrics of the batch describe the episodes.
+        """
+        shape = noise.shape[:2]
+        flags = np.zeros((2, *shape), np.bool_)
+        numbers = np.zeros((2, *shape))
+        mean = np.asarray(means, np.float64)
+        kernels.roll_out(
+            mean, noise, self.everyone.copy(), *flags, *numbers, *self._rules, *self._seen
+        )
+        return RollOut(*flags, *numbers)
 
     def info(self, n: int) -> dict[str, Any]:
         """Return the `info` of world n, see `SquareEnv`."""

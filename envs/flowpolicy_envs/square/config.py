@@ -87,6 +87,8 @@ class SquareConfig:
     stack: int = 2
     dt: float = 0.01
     substeps: int = 25
+    slew: float = 0.0
+    friction_cone: bool = False
     warm_steps: int = field(init=False, repr=False)
     picked: NDArray[np.int64] = field(init=False, repr=False)
     noise: NDArray[np.float64] = field(init=False, repr=False)
@@ -150,6 +152,11 @@ class SquareConfig:
                 f"or contact would be faster than fingers, got {high['max_force'] * self.dt:.3g} * "
                 f"{mobility:.3g} > {low['max_speed']:.3g}"
             )
+
+    @property
+    def slew_substeps(self) -> int:
+        """Number of substeps in which targets move to those of the latest action."""
+        return round(self.slew / self.dt)
 
     @property
     def frame_width(self) -> int:

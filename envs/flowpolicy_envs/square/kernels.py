@@ -51,11 +51,13 @@ N_FEATURES = 4 + ACTIONS + ACTIONS + 1
 _PUSH, _PULL, _NORMAL_X, _NORMAL_Y, _LEVER, _TANGENT_LEVER, _SHARE, _ROOM = range(8)
 _LIMIT, _LEAST_RUB, _MOST_RUB = range(8, 11)
 # The last row holds values derived from the constants.
-_PER_DT, _PER_MASS, _PER_INERTIA, _PER_DRAG, _LINEAR, _ANGULAR = range(6)
+_PER_DT, _PER_MASS, _PER_INERTIA, _PER_DRAG, _LINEAR, _ANGULAR, _LIFT = range(7)
 SCRATCH = (FINGERS + 1, 11)
 
 _STANDSTILL = 1e-30
 """Units or radians per second."""
+
+_LOG_2 = math.log(2.0)
 
 SWEEPS = 3
 """Iterations that match the contact forces to the velocity they cause. Each sweep reduces the
@@ -223,9 +225,12 @@ def _is_broken(fingers: FloatArray, starts: FloatArray, reach: float) -> bool:
 def simulate(
     dt: float,
     substeps: int,
+    slew: int,
+    cone: bool,
     constants: FloatArray,
     starts: FloatArray,
     targets: FloatArray,
+    path: FloatArray,
     body: FloatArray,
     fingers: FloatArray,
     scratch: FloatArray,
@@ -237,9 +242,14 @@ def simulate(
     Args:
         dt: Seconds per substep.
         substeps: Number of substeps.
+        slew: Number of substeps in which the controllers' targets move linearly from `path[0]` to
+            `targets`. With 0 they jump.
+        cone: Whether to compute the force with which friction can still carry the square while it
+            also drags it along the plane.
         constants: Physical constants, (12,).
         starts: Starts of the fingers, (4, 2).
         targets: Targets of the fingers' controllers, (4, 2).
+        path: The targets before and, overwritten, the present ones, (2, 4, 2).
         body: Position, angle and velocities x, y, theta, vx, vy, omega of the square, (6,).
         fingers: Positions, (4, 2).
         scratch: Working memory, (5, 11).
@@ -253,14 +263,26 @@ def simulate(
     derived = scratch[FINGERS]
     _derive(dt, constants, derived)
     presses[:] = 0.0
+    derived[_LIFT] = 0.0
+    aims = targets if slew == 0 else path[1]
     for k in range(substeps):
-        _substep(dt, constants, derived, targets, body, fingers, scratch, forces)
+        if slew > 0:
+            share = min((k + 1.0) / slew, 1.0)
+            for i in range(FINGERS):
+                for j in range(2):
+                    aims[i, j] = path[0, i, j] + share * (targets[i, j] - path[0, i, j])
+        _substep(dt, constants, derived, aims, body, fingers, scratch, forces)
         for i in range(FINGERS):
             presses[i] += forces[i, 0]
+            if cone:
+                most = constants[FRICTION] * forces[i, 0]
+                derived[_LIFT] += math.sqrt(max(most * most - forces[i, 1] ** 2, 0.0))
         if _is_broken(fingers, starts, constants[REACH]):
             presses /= k + 1.0
+            derived[_LIFT] /= k + 1.0
             return True
     presses /= substeps
+    derived[_LIFT] /= substeps
     return False
 
 
@@ -430,9 +452,12 @@ def step_batch(
     active: np.ndarray,
     dt: float,
     substeps: int,
+    slew: int,
+    cone: bool,
     warm_steps: float,
     reward_terms: FloatArray,
     goals: FloatArray,
+    path: FloatArray,
     scratch: FloatArray,
     forces: FloatArray,
     rewards: FloatArray,
@@ -479,13 +504,17 @@ def step_batch(
             for k in range(2):
                 action = _clip(requests[n, 2 * i + k], -1.0, 1.0)
                 actions[n, 2 * i + k] = action
+                path[0, i, k] = targets[n, i, k]
                 targets[n, i, k] = starts[n, i, k] + reach * action
         broken = simulate(
             dt,
             substeps,
+            slew,
+            cone,
             constants[n],
             starts[n],
             targets[n],
+            path,
             bodies[n],
             fingers[n],
             scratch,
@@ -495,7 +524,9 @@ def step_batch(
         press = 0.0
         for i in range(FINGERS):
             press += presses[n, i]
-        held[n] = constants[n, FRICTION] * press >= constants[n, WEIGHT]
+        # Friction that drags the square along its plane cannot carry it at the same time.
+        lift = scratch[FINGERS, _LIFT] if cone else constants[n, FRICTION] * press
+        held[n] = lift >= constants[n, WEIGHT]
         # The warm-up ends when the timer that the agent saw before this step is 0.
         warm = tallies[n, N_STEPS] < warm_steps
         _tally(held[n], warm, bodies[n], tallies[n])
@@ -545,3 +576,100 @@ def step_batch(
             row[row.shape[0] - width :],
         )
     return -1
+
+
+@_compiled
+def roll_out(
+    means: FloatArray,
+    noise: FloatArray,
+    active: np.ndarray,
+    taken: np.ndarray,
+    failed: np.ndarray,
+    gathered: FloatArray,
+    log_slopes: FloatArray,
+    dt: float,
+    substeps: int,
+    slew: int,
+    cone: bool,
+    warm_steps: float,
+    reward_terms: FloatArray,
+    goals: FloatArray,
+    path: FloatArray,
+    scratch: FloatArray,
+    forces: FloatArray,
+    rewards: FloatArray,
+    terminated: np.ndarray,
+    picked: np.ndarray,
+    observation_noise: FloatArray,
+    features: FloatArray,
+    constants: FloatArray,
+    starts: FloatArray,
+    bodies: FloatArray,
+    fingers: FloatArray,
+    targets: FloatArray,
+    actions: FloatArray,
+    presses: FloatArray,
+    tallies: FloatArray,
+    metrics: FloatArray,
+    held: np.ndarray,
+    found: np.ndarray,
+    success: np.ndarray,
+    ends: np.ndarray,
+    observations: np.ndarray,
+) -> None:
+    """Step the `active` (N,) worlds until they end, with the actions tanh(u), in place.
+
+    In step t, u is the sum of `means` (8,) and `noise` (T, N, 8). Overwritten, each (T, N), are
+    `taken` by whether the world was still active, `failed` by whether it ended, `gathered` by the
+    rewards, and `log_slopes` by the sum over the components of log(1 - tanh(u)^2).
+    """
+    steps, count = noise.shape[0], noise.shape[1]
+    requests = np.zeros((count, ACTIONS))
+    for t in range(steps):
+        for n in range(count):
+            taken[t, n] = active[n]
+            log_slope = 0.0
+            for j in range(ACTIONS):
+                u = means[j] + noise[t, n, j]
+                requests[n, j] = math.tanh(u)
+                # log(1 - tanh(u)^2) without cancellation.
+                size = abs(u)
+                log_slope += 2.0 * (_LOG_2 - size - math.log1p(math.exp(-2.0 * size)))
+            log_slopes[t, n] = log_slope
+        step_batch(
+            requests,
+            active,
+            dt,
+            substeps,
+            slew,
+            cone,
+            warm_steps,
+            reward_terms,
+            goals,
+            path,
+            scratch,
+            forces,
+            rewards,
+            terminated,
+            picked,
+            observation_noise,
+            features,
+            constants,
+            starts,
+            bodies,
+            fingers,
+            targets,
+            actions,
+            presses,
+            tallies,
+            metrics,
+            held,
+            found,
+            success,
+            ends,
+            observations,
+        )
+        for n in range(count):
+            gathered[t, n], failed[t, n] = rewards[n], terminated[n]
+            if terminated[n]:
+                active[n] = False

@@ -1,0 +1,1 @@
+"""How much coordinated noise is worth on a Square, predicted without training an agent."""

@@ -1,0 +1,137 @@
+"""`python -m sb3_flowpolicy.coordination`: how much coordinated noise is worth on a Square."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_DESCRIPTION = """\
+Predict, without training, how much an agent gains from noise that correlates between fingers.
+
+For an environment and its constants, this searches the best policy that presses with a constant
+mean plus normal noise, squashed by tanh, once per family of noise:
+
+  independent   one standard deviation per action, as in a diagonal Gaussian
+  pink          the same, correlated in time
+  rank 2        a diagonal plus two joint directions, as in the low-rank policy
+  full          any covariance that suits the symmetry of the task; a flow can express it
+
+Each policy maximizes SAC's objective at its stationary rate,
+
+  V = (mean reward + ent_coef * entropy - failure * hazard) / (1 - gamma * (1 - hazard)),
+
+with the hazard, the probability per step of dropping the square or breaking a finger. Trained
+agents also react to what they observe, so their returns are higher: the differences between
+families are a prediction, the values a lower bound. If the families do not differ here, do not
+expect trained policies to differ.
+
+Columns: median actions that press along x and y, V, entropy of the squashed actions (nats), hazard
+per step, share of it in which a finger breaks, reward per step and its share of the reward for
+holding, and, averaged over episodes after the warm-up, standard deviation of x, maximum of |x|,
+maximum distance from the middle, and the share of episodes in which the goal was found."""
+_EPILOG = """\
+examples:
+  python -m sb3_flowpolicy.coordination SquareMoveX-v0
+  python -m sb3_flowpolicy.coordination SquareMoveX-v0 --set max_force=2.4 --task effort=0.1 angle=1
+  python -m sb3_flowpolicy.coordination SquareHold-v0 --ent-coef 0.15 --modes
+  python -m sb3_flowpolicy.coordination SquareFindGoal-v0 --budget 1000 --json prediction.json
+
+With the default budget, four families take about a minute on one core. The objective is noisy:
+compare searches with other --seed values before you rely on a small difference."""
+
+_HEAD = "family       press x, y     V  entropy  hazard broken reward kept  x std  x max distance goals"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.coordination",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("env", metavar="ID", help="id of a Square, for example SquareMoveX-v0")
+    given = {"nargs": "*", "type": _assignment, "default": []}
+    add("--set", metavar="ARG=VALUE", help="arguments of the environment (YAML values)", **given)
+    add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **given)
+    add("--ent-coef", type=float, default=0.05, help="entropy coefficient (default: 0.05)")
+    add("--gamma", type=float, default=0.9, help="discount factor (default: 0.9)")
+    names = ("independent", "pink", "rank 2", "full")
+    families = f"some of {', '.join(map(repr, names))} (default: all)"
+    add("--families", nargs="+", choices=names, default=names, metavar="NAME", help=families)
+    add("--budget", type=int, default=500, help="candidates per family (default: 500)")
+    add("--episodes", type=int, default=48, help="episodes per candidate (default: 48)")
+    add("--seed", type=int, default=0, help="seed of the search (default: 0)")
+    add("--modes", action="store_true", help="also print the noise of each joint motion")
+    add("--json", type=Path, metavar="FILE", help="also write the results to this file")
+    args = parser.parse_args(arguments)
+    if args.json is not None and not args.json.absolute().parent.is_dir():
+        parser.error(f"--json must name a file in an existing directory, got {args.json}")
+    # Slow imports that --help does not need.
+    try:
+        from tqdm import tqdm
+
+        from sb3_flowpolicy.common.files import write_json
+        from sb3_flowpolicy.coordination.search import predict, setting_of
+    except ModuleNotFoundError as error:
+        parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
+
+    try:
+        setting = setting_of(
+            args.env,
+            dict(args.task),
+            dict(args.set),
+            ent_coef=args.ent_coef,
+            gamma=args.gamma,
+            episodes=args.episodes,
+            budget=args.budget,
+            seed=args.seed,
+        )
+    except (ValueError, TypeError) as error:
+        parser.error(str(error))
+    with tqdm(total=args.budget * len({"independent", *args.families}), unit=" policies") as bar:
+        found = predict(setting, args.families, bar.update)
+    print(_HEAD)
+    for name, row in found.items():
+        print(
+            f"{name:12s} {row.press_x:6.2f} {row.press_y:6.2f} {row.value:6.2f} {row.entropy:7.2f} "
+            f"{row.hazard:8.4f} {row.broken:6.2f} {row.reward:6.2f} {row.kept:4.2f} "
+            f"{row.x_std:6.3f} {row.x_max:6.3f} {row.distance_max:8.3f} {row.found:5.2f}"
+        )
+        if args.modes:
+            for mode, (first, second) in row.modes.items():
+                print(f"  {mode}: {first:.2f} and {second:.2f}")
+    base = found["independent"]
+    for name, row in found.items():
+        if name != "independent":
+            goals = f", goals x {row.found / base.found:.2f}" if base.found else ""
+            print(
+                f"{name} against independent: V {row.value - base.value:+.2f}, entropy "
+                f"{row.entropy - base.entropy:+.2f} nats, x std x {row.x_std / base.x_std:.2f}, "
+                f"x max x {row.x_max / base.x_max:.2f}{goals}"
+            )
+    if args.json is not None:
+        told = {name: vars(row) for name, row in found.items()}
+        write_json(args.json, {"settings": _told(args), "families": told})
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    name, sign, value = text.partition("=")
+    if not name or not sign:
+        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
+    return name, yaml.safe_load(value)
+
+
+def _told(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments as they were given."""
+    kept = {name: value for name, value in vars(args).items() if name not in ("json", "modes")}
+    return {**kept, "set": dict(args.set), "task": dict(args.task)}
+
+
+if __name__ == "__main__":
+    main()

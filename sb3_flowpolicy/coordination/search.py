@@ -1,0 +1,233 @@
+"""The best policy of a family of noise, under SAC's objective at its stationary rate."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cma
+import gymnasium as gym
+import numpy as np
+import torch as th
+from flowpolicy_envs.square import kernels
+from flowpolicy_envs.square.batch import METRICS, SquareBatch
+from flowpolicy_envs.square.config import SquareConfig
+from flowpolicy_envs.square.tasks import as_task
+
+from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.coordination.families import (
+    FAMILIES,
+    INDEPENDENT_START,
+    INWARDS,
+    MODES,
+    Array,
+)
+
+_DRAWS = 40
+"""Sets of random numbers that a search uses in turn, so that it does not fit a single one."""
+_FINAL_EPISODES = 512
+"""Episodes with other random numbers, which measure what was found."""
+_PRESS_START, _PRESS_STEP = 0.85, 0.3
+"""Mean before squashing at the start, and how much of it is a unit of the search."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An environment, an objective, and the length of a search.
+
+    Args:
+        config: The rules of the environment.
+        steps: Steps of an episode.
+        ent_coef: Entropy coefficient.
+        gamma: Discount factor.
+        episodes: Simulated per candidate.
+        budget: Candidates per family.
+        seed: Seed of the search; its random numbers do not depend on it.
+    """
+
+    config: SquareConfig
+    steps: int = 80
+    ent_coef: float = 0.05
+    gamma: float = 0.9
+    episodes: int = 48
+    budget: int = 500
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a policy is worth, per step after the warm-up.
+
+    Attributes:
+        press_x, press_y: Median action that presses, along x and along y.
+        value: SAC's objective.
+        entropy: Entropy of the squashed actions, nats.
+        hazard: Probability per step that the episode fails; a finger that breaks during the
+            warm-up counts, too.
+        broken: Share of the failures in which a finger broke.
+        reward: Mean reward without the penalty of a failure.
+        kept: Reward as a share of the reward for holding.
+        x_std, x_max, distance_std, distance_max: The environment's metrics, averaged over episodes
+            in proportion to their steps after the warm-up.
+        found: Share of the episodes in which the goal was found.
+        modes: Standard deviation before squashing of each mode, in the order of `MODES`.
+    """
+
+    press_x: float
+    press_y: float
+    value: float
+    entropy: float
+    hazard: float
+    broken: float
+    reward: float
+    kept: float
+    x_std: float
+    x_max: float
+    distance_std: float
+    distance_max: float
+    found: float
+    modes: dict[str, tuple[float, float]]
+
+
+def setting_of(
+    env_id: str, task: dict[str, float] | None = None, arguments: dict[str, Any] | None = None,
+    **options: Any,
+) -> Setting:
+    """Return the setting of an environment id with other constants.
+
+    Args:
+        env_id: Id of a Square.
+        task: Coefficients of the reward that differ from the id's.
+        arguments: Arguments of the environment that differ from the id's.
+        **options: Arguments of `Setting`.
+
+    Raises:
+        ValueError: If the id is none of a Square, or a value is out of range.
+        TypeError: If a coefficient or an argument is unknown.
+
+    Example:
+        >>> setting_of("SquareMoveX-v0", {"angle": 1.0}, {"max_force": 2.4}).config.task.angle
+        1.0
+    """
+    spec = gym.spec(env_id)
+    if spec.entry_point != "flowpolicy_envs.square.env:SquareEnv":
+        raise ValueError(f"the id must be that of a Square, got {env_id}")
+    kwargs = {**spec.kwargs, **(arguments or {})}
+    rules = as_task(kwargs.pop("task", "hold"))
+    config = SquareConfig(type(rules)(**{**vars(rules), **(task or {})}), **kwargs)
+    return Setting(config, spec.max_episode_steps or 80, **options)
+
+
+def predict(
+    setting: Setting, names: tuple[str, ...] = tuple(FAMILIES), report: Callable[[int], None] | None = None
+) -> dict[str, Prediction]:
+    """Search the best policy of each family.
+
+    A policy presses with a constant mean, plus noise, squashed by tanh. Independent noise is always
+    searched, because the other families begin where it ended.
+
+    Args:
+        setting: What to search.
+        names: Names of `FAMILIES`.
+        report: Called with the number of candidates after each generation.
+    """
+    batch = SquareBatch(setting.config, setting.episodes)
+    final = SquareBatch(setting.config, _FINAL_EPISODES)
+    start, found = np.concatenate([np.zeros(2), INDEPENDENT_START]), {}
+    for name in ("independent", *(name for name in names if name != "independent")):
+        family = FAMILIES[name]
+        begin = np.concatenate([start[:2], family.start(start[2:])])
+        options = {"seed": setting.seed + 1, "verbose": -9, "maxfevals": setting.budget}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # cma's, about options that it changes itself
+            search = cma.CMAEvolutionStrategy(begin, 0.3, options)
+            while not search.stop():
+                points = search.ask()
+                draws = search.countiter % _DRAWS
+                values = [_evaluate(setting, name, point, batch, draws).value for point in points]
+                search.tell(points, [-value for value in values])
+                if report is not None:
+                    report(len(points))
+        best = np.asarray(search.mean)
+        if name == "independent":
+            start = best
+        found[name] = _evaluate(setting, name, best, final, _DRAWS)
+    return found
+
+
+def _evaluate(
+    setting: Setting, name: str, parameters: Array, batch: SquareBatch, draws: int
+) -> Prediction:
+    """Simulate a policy with the random numbers `draws`."""
+    family = FAMILIES[name]
+    means = np.clip(_PRESS_START + _PRESS_STEP * parameters[:2], 0.0, 3.0) @ INWARDS
+    root = family.root(parameters[2:])
+    noise = _standard_noise(
+        family.color, (setting.steps, len(batch.rewards), root.shape[1]), draws
+    )
+    return measure(setting, means, root, noise @ root.T, batch, draws)
+
+
+def measure(
+    setting: Setting, means: Array, root: Array, noise: Array, batch: SquareBatch, seed: int
+) -> Prediction:
+    """Simulate one episode in each world of `batch`.
+
+    Args:
+        setting: Objective and rules.
+        means: Mean of the actions before squashing, (8,).
+        root: R (8, M) with the covariance R R^T of the noise.
+        noise: Added to the means, (T, N, 8), for T steps in N worlds.
+        batch: N worlds with the rules of the setting.
+        seed: Seed of the starts.
+    """
+    generator = np.random.default_rng(seed)
+    batch.reset(batch.everyone, lambda _: generator)
+    out = batch.roll_out(means, noise)
+    task, after = setting.config.task, slice(setting.config.warm_steps, None)
+    lengths = out.taken[after].sum(axis=0)
+    steps = max(int(lengths.sum()), 1)
+    failures = int(out.failed.sum())
+    hazard = min(failures / steps, 1.0)
+    penalties = task.failure * out.failed[after].sum()
+    reward = (out.rewards[after].sum() + penalties) / steps
+    squashing = float((out.log_slopes[after] * out.taken[after]).sum()) / steps
+    covariance = root @ root.T
+    entropy = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * np.e * covariance)[1]) + squashing
+    gain = reward + setting.ent_coef * entropy - task.failure * hazard
+    metrics = dict(zip(METRICS, lengths @ batch.metrics / steps, strict=True))
+    presses = np.tanh(INWARDS @ means / 2.0)
+    return Prediction(
+        press_x=float(presses[0]),
+        press_y=float(presses[1]),
+        value=float(gain / (1.0 - setting.gamma * (1.0 - hazard))),
+        entropy=entropy,
+        hazard=hazard,
+        broken=int((batch.ends == kernels.BROKEN).sum()) / max(failures, 1),
+        reward=float(reward),
+        kept=float(reward / task.held) if task.held else 0.0,
+        x_std=float(metrics["x_std"]),
+        x_max=float(metrics["x_max"]),
+        distance_std=float(metrics["distance_std"]),
+        distance_max=float(metrics["distance_max"]),
+        found=float(batch.found.mean()),
+        modes={
+            name: tuple(float(np.sqrt(mode @ covariance @ mode)) for mode in pair)
+            for name, pair in MODES.items()
+        },
+    )
+
+
+@functools.lru_cache(maxsize=2 * _DRAWS)
+def _standard_noise(color: float, shape: tuple[int, int, int], seed: int) -> Array:
+    """Return standard normal noise (T, N, M), correlated in time as an agent's would be."""
+    steps, count, width = shape
+    if color == 0.0:
+        return np.random.default_rng(seed).standard_normal(shape)
+    process = NoiseProcess(width, count, color, horizon=steps)
+    generator = th.Generator().manual_seed(seed)
+    white = th.randn((steps, *process.white_shape), generator=generator, dtype=th.float64)
+    return th.stack([process.step(step) for step in white]).numpy()
