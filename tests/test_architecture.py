@@ -26,7 +26,7 @@ LIBRARY = [
     "diagnostics",
     "zoo",
 ]
-RESEARCH = ["density", "benchmarks", "experiments"]
+RESEARCH = ["density", "benchmarks", "experiments", "coordination"]
 FLOORS = LIBRARY + RESEARCH
 THIRD_PARTY = {
     "distributions": {"torch"},

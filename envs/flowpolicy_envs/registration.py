@@ -45,12 +45,28 @@ _MAX_EPISODE_STEPS = {"TunnelSpline-v0": 60}
 _MOVE: dict[str, Any] = {"max_force": 1.95, "warm_up": 4.0}
 """The weight of 3 N requires 6 N: four fingers of 1.95 N exert 7.8 N, three only 5.85 N."""
 
+_MOVE_V1: dict[str, Any] = {
+    **_MOVE,
+    "friction": 1.25,
+    "weight": 7.5,
+    "kp": 50.0,
+    "kd": 0.5,
+    "linear_damping": 1.0,
+    "slew": 0.25,
+    "friction_cone": True,
+}
+"""Again 6 N are required. Stiff fingers that pull against each other use up their friction, which
+independent noise causes and joint motion does not; see docs/environments/square.md."""
+
 SQUARE_IDS: dict[str, dict[str, Any]] = {
     "Square-v0": {},
     "SquareHold-v0": {"task": "hold"},
     "SquareMove-v0": {**_MOVE, "task": "move"},
     "SquareMoveX-v0": {**_MOVE, "task": "move_x"},
     "SquareFindGoal-v0": {**_MOVE, "task": "find_goal"},
+    "SquareMove-v1": {**_MOVE_V1, "task": "move"},
+    "SquareMoveX-v1": {**_MOVE_V1, "task": "move_x"},
+    "SquareFindGoal-v1": {**_MOVE_V1, "task": "find_goal"},
 }
 """The Square ids and the arguments in which they differ from `Square-v0`."""
 

@@ -43,7 +43,9 @@ examples:
 With the default budget, four families take about a minute on one core. The objective is noisy:
 compare searches with other --seed values before you rely on a small difference."""
 
-_HEAD = "family       press x, y     V  entropy  hazard broken reward kept  x std  x max distance goals"
+_HEAD = (
+    "family       press x, y     V  entropy  hazard broken reward kept  x std  x max distance goals"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,9 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("env", metavar="ID", help="id of a Square, for example SquareMoveX-v0")
-    given = {"nargs": "*", "type": _assignment, "default": []}
-    add("--set", metavar="ARG=VALUE", help="arguments of the environment (YAML values)", **given)
-    add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **given)
+    pairs: dict[str, Any] = {"nargs": "*", "type": _assignment, "default": []}
+    add("--set", metavar="ARG=VALUE", help="arguments of the environment (YAML values)", **pairs)
+    add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **pairs)
     add("--ent-coef", type=float, default=0.05, help="entropy coefficient (default: 0.05)")
     add("--gamma", type=float, default=0.9, help="discount factor (default: 0.9)")
     names = ("independent", "pink", "rank 2", "full")

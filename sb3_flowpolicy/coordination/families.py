@@ -1,8 +1,8 @@
 """Families of normal noise for the eight actions of a Square, from independent to correlated.
 
-Reflections of the world along x and along y change neither the task nor the best policy, so
-opposite fingers share their parameters, and only modes that behave alike under both reflections
-correlate.
+Reflections of the world along x and along y do not change holding and moving, so opposite fingers
+share their parameters, and modes correlate only if they behave alike under both reflections. The
+exception is joint motion along x and y, which correlate when a goal lies on the diagonal.
 """
 
 from __future__ import annotations
@@ -96,23 +96,24 @@ def rank_2(parameters: Array) -> Array:
 
 
 def full(parameters: Array) -> Array:
-    """Return the root of any covariance that does not change under the reflections.
+    """Return the root of any covariance that suits the symmetry of the tasks.
 
     Args:
         parameters: Per pair of modes, the logarithms of two scales and how much the second mode
-            follows the first, (12,).
+            follows the first; then how much joint motion along y follows that along x, (13,).
     """
     columns = []
     for (first, second), (log_1, log_2, lean) in zip(
-        MODES.values(), parameters.reshape(4, 3), strict=True
+        MODES.values(), parameters[:12].reshape(4, 3), strict=True
     ):
         scale_1, scale_2 = _scales(np.array([log_1, log_2]))
         columns += [scale_1 * (first + lean * second), scale_2 * second]
+    columns[2] = columns[2] + parameters[12] * columns[4]
     return np.column_stack(columns)
 
 
 def _start_rank_2(parameters: Array) -> Array:
-    joint = [sum(MODES[name]) for name in ("joint x", "joint y")]
+    joint = [np.add(*MODES[name]) for name in ("joint x", "joint y")]
     return np.concatenate([parameters - 0.1, _JOINT * np.column_stack(joint).ravel()])
 
 
@@ -120,7 +121,7 @@ def _start_full(parameters: Array) -> Array:
     x, y, along_x, along_y = parameters
     # All four fingers move jointly, plus as much independent noise along the faces as before.
     joint_x, joint_y = [x, along_x, 1.0], [y, along_y, 1.0]
-    return np.array([x, y, 0.0, *joint_x, *joint_y, along_x, along_y, 0.0])
+    return np.array([x, y, 0.0, *joint_x, *joint_y, along_x, along_y, 0.0, 0.0])
 
 
 def _same(parameters: Array) -> Array:

@@ -12,11 +12,11 @@ import cma
 import gymnasium as gym
 import numpy as np
 import torch as th
+
 from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.batch import METRICS, SquareBatch
 from flowpolicy_envs.square.config import SquareConfig
 from flowpolicy_envs.square.tasks import as_task
-
 from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
 from sb3_flowpolicy.coordination.families import (
     FAMILIES,
@@ -93,7 +93,9 @@ class Prediction:
 
 
 def setting_of(
-    env_id: str, task: dict[str, float] | None = None, arguments: dict[str, Any] | None = None,
+    env_id: str,
+    task: dict[str, float] | None = None,
+    arguments: dict[str, Any] | None = None,
     **options: Any,
 ) -> Setting:
     """Return the setting of an environment id with other constants.
@@ -122,7 +124,9 @@ def setting_of(
 
 
 def predict(
-    setting: Setting, names: tuple[str, ...] = tuple(FAMILIES), report: Callable[[int], None] | None = None
+    setting: Setting,
+    names: tuple[str, ...] = tuple(FAMILIES),
+    report: Callable[[int], None] | None = None,
 ) -> dict[str, Prediction]:
     """Search the best policy of each family.
 
@@ -165,9 +169,7 @@ def _evaluate(
     family = FAMILIES[name]
     means = np.clip(_PRESS_START + _PRESS_STEP * parameters[:2], 0.0, 3.0) @ INWARDS
     root = family.root(parameters[2:])
-    noise = _standard_noise(
-        family.color, (setting.steps, len(batch.rewards), root.shape[1]), draws
-    )
+    noise = _standard_noise(family.color, (setting.steps, len(batch.rewards), root.shape[1]), draws)
     return measure(setting, means, root, noise @ root.T, batch, draws)
 
 
@@ -187,7 +189,7 @@ def measure(
     generator = np.random.default_rng(seed)
     batch.reset(batch.everyone, lambda _: generator)
     out = batch.roll_out(means, noise)
-    task, after = setting.config.task, slice(setting.config.warm_steps, None)
+    task, after = as_task(setting.config.task), slice(setting.config.warm_steps, None)
     lengths = out.taken[after].sum(axis=0)
     steps = max(int(lengths.sum()), 1)
     failures = int(out.failed.sum())
@@ -215,8 +217,11 @@ def measure(
         distance_max=float(metrics["distance_max"]),
         found=float(batch.found.mean()),
         modes={
-            name: tuple(float(np.sqrt(mode @ covariance @ mode)) for mode in pair)
-            for name, pair in MODES.items()
+            name: (
+                float(np.sqrt(first @ covariance @ first)),
+                float(np.sqrt(second @ covariance @ second)),
+            )
+            for name, (first, second) in MODES.items()
         },
     )
 

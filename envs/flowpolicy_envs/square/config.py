@@ -120,6 +120,11 @@ class SquareConfig:
             value = getattr(self, name)
             if not is_whole(value) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+        check_not_negative("slew", self.slew)
+        if self.slew > round(self.dt * self.substeps, 9):
+            raise ValueError(
+                f"slew must be at most a step, {self.dt * self.substeps:g} s, got {self.slew}"
+            )
         self._check_stability()
         # Rounded first, so that 2 s / 0.25 s does not become nine steps.
         steps = math.ceil(round(self.warm_up / (self.dt * self.substeps), 9))

@@ -29,7 +29,9 @@ class SquareEnv(BatchEnv):
 
     $$\mu \sum_i \bar F_{n,i} \ge W$$
 
-    with the fingers' normal forces $\bar F_{n,i}$ averaged over a step of the agent. Four times a
+    with the fingers' normal forces $\bar F_{n,i}$ averaged over a step of the agent. With
+    `friction_cone`, tangential forces $F_{t,i}$ use up part of the friction: the left side becomes
+    the average of $\sum_i \sqrt{(\mu F_{n,i})^2 - F_{t,i}^2}$. Four times a
     second, the agent requests a target for each finger, to which a PD controller moves the finger
     with limited force. Fingers are massless points with viscous drag; the square has mass and
     inertia. Contact is rigid, with Coulomb friction. The mechanics are simulated at 100 Hz;
@@ -132,6 +134,8 @@ class SquareEnv(BatchEnv):
     | `stack` | 2 | at least 1 | number of frames observed |
     | `dt` | 0.01 | positive | s per substep |
     | `substeps` | 25 | at least 1 | per step of the agent |
+    | `slew` | 0 | at least 0, at most a step | s in which targets move to the requested ones |
+    | `friction_cone` | `False` | | friction that drags the square does not carry it, see below |
     | `render_mode` | `None` | `None`, `"rgb_array"`, `"human"` | effect of `render()` |
     | `render_size` | 600 | at least 16 | edge of a frame, pixels |
 
@@ -152,6 +156,9 @@ class SquareEnv(BatchEnv):
 
     ## Version History
 
+    * v1 (`SquareMove`, `SquareMoveX`, `SquareFindGoal`): `friction_cone`, `slew` of 0.25 s,
+      stiffer fingers (`kp` 50, `kd` 0.5) with more friction (1.25, `weight` 7.5) and less
+      `linear_damping` (1), so that independent noise breaks the grip and joint motion does not
     * v0: Initial version
     """
 
