@@ -45,18 +45,21 @@ _MAX_EPISODE_STEPS = {"TunnelSpline-v0": 60}
 _MOVE: dict[str, Any] = {"max_force": 1.95, "warm_up": 4.0}
 """The weight of 3 N requires 6 N: four fingers of 1.95 N exert 7.8 N, three only 5.85 N."""
 
-_MOVE_V1: dict[str, Any] = {
-    **_MOVE,
+_V1: dict[str, Any] = {
     "friction": 1.25,
-    "weight": 7.5,
     "kp": 50.0,
     "kd": 0.5,
-    "linear_damping": 1.0,
     "slew": 0.25,
     "friction_cone": True,
 }
-"""Again 6 N are required. Stiff fingers that pull against each other use up their friction, which
+"""Stiff fingers that pull against each other use up their friction, which
 independent noise causes and joint motion does not; see docs/environments/square.md."""
+
+_MOVE_V1: dict[str, Any] = {**_MOVE, **_V1, "weight": 7.5, "linear_damping": 1.0}
+"""Again 6 N are required."""
+
+_HOLD_V1: dict[str, Any] = {**_V1, "weight": 11.25, "max_force": 3.0}
+"""9 N are required: all that three fingers can exert."""
 
 SQUARE_IDS: dict[str, dict[str, Any]] = {
     "Square-v0": {},
@@ -64,13 +67,14 @@ SQUARE_IDS: dict[str, dict[str, Any]] = {
     "SquareMove-v0": {**_MOVE, "task": "move"},
     "SquareMoveX-v0": {**_MOVE, "task": "move_x"},
     "SquareFindGoal-v0": {**_MOVE, "task": "find_goal"},
+    "SquareHold-v1": {**_HOLD_V1, "task": "hold"},
     "SquareMove-v1": {**_MOVE_V1, "task": "move"},
     "SquareMoveX-v1": {**_MOVE_V1, "task": "move_x"},
     "SquareFindGoal-v1": {**_MOVE_V1, "task": "find_goal"},
 }
 """The Square ids and the arguments in which they differ from `Square-v0`."""
 
-_SQUARE_STEPS = {"Square-v0": 40, "SquareHold-v0": 40}
+_SQUARE_STEPS = {"Square-v0": 40, "SquareHold-v0": 40, "SquareHold-v1": 40}
 
 
 def register_envs() -> None:

@@ -40,7 +40,7 @@ examples:
   python -m sb3_flowpolicy.coordination SquareHold-v0 --ent-coef 0.15 --modes
   python -m sb3_flowpolicy.coordination SquareFindGoal-v0 --budget 1000 --json prediction.json
 
-With the default budget, four families take about a minute on one core. The objective is noisy:
+With the default budget, a family takes about half a minute on one core. The objective is noisy:
 compare searches with other --seed values before you rely on a small difference."""
 
 _HEAD = (
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = ("independent", "pink", "rank 2", "full")
     families = f"some of {', '.join(map(repr, names))} (default: all)"
     add("--families", nargs="+", choices=names, default=names, metavar="NAME", help=families)
-    add("--budget", type=int, default=500, help="candidates per family (default: 500)")
+    add("--budget", type=int, default=800, help="candidates per family (default: 800)")
     add("--episodes", type=int, default=48, help="episodes per candidate (default: 48)")
     add("--seed", type=int, default=0, help="seed of the search (default: 0)")
     add("--modes", action="store_true", help="also print the noise of each joint motion")

@@ -53,7 +53,7 @@ class Setting:
     ent_coef: float = 0.05
     gamma: float = 0.9
     episodes: int = 48
-    budget: int = 500
+    budget: int = 800
     seed: int = 0
 
 

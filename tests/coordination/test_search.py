@@ -62,10 +62,8 @@ def test_coordination_pays_where_opposed_fingers_lose_their_grip():
 
 def test_command_writes_what_it_prints(tmp_path, capsys):
     file = tmp_path / "prediction.json"
-    main(
-        ["SquareMoveX-v0", "--task", "angle=1", "--set", "max_force=2.4", "--budget", "10"]
-        + ["--episodes", "4", "--families", "pink", "--json", str(file)]
-    )
+    given = "SquareMoveX-v0 --task angle=1 --set max_force=2.4 --budget 10 --episodes 4"
+    main([*given.split(), "--families", "pink", "--json", str(file)])
     told = json.loads(file.read_text())
     assert list(told["families"]) == ["independent", "pink"]
     assert told["settings"]["set"] == {"max_force": 2.4}

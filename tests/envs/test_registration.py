@@ -26,6 +26,10 @@ EXPECTED_SQUARES = {
     "SquareMove-v0": ("Move", 1.95, 4.0, 80),
     "SquareMoveX-v0": ("MoveX", 1.95, 4.0, 80),
     "SquareFindGoal-v0": ("FindGoal", 1.95, 4.0, 80),
+    "SquareHold-v1": ("Hold", 3.0, 2.0, 40),
+    "SquareMove-v1": ("Move", 1.95, 4.0, 80),
+    "SquareMoveX-v1": ("MoveX", 1.95, 4.0, 80),
+    "SquareFindGoal-v1": ("FindGoal", 1.95, 4.0, 80),
 }
 
 
