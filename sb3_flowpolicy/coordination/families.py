@@ -119,7 +119,7 @@ def _start_rank_2(parameters: Array) -> Array:
 
 def _start_full(parameters: Array) -> Array:
     x, y, along_x, along_y = parameters
-    # All four fingers move and turn the square jointly, plus as much independent noise along the faces as before.
+    # All four fingers move and turn the square jointly, plus independent noise as before.
     joint_x, joint_y = [x, along_x, 1.0], [y, along_y, 1.0]
     return np.array([x, y, 0.0, *joint_x, *joint_y, x, along_y, 1.0, 0.0])
 
