@@ -26,7 +26,7 @@ LIBRARY = [
     "diagnostics",
     "zoo",
 ]
-RESEARCH = ["density", "benchmarks", "experiments", "coordination"]
+RESEARCH = ["density", "benchmarks", "experiments"]
 FLOORS = LIBRARY + RESEARCH
 THIRD_PARTY = {
     "distributions": {"torch"},

@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("cma")
 
 from flowpolicy_envs.square.batch import SquareBatch
-from sb3_flowpolicy.coordination.__main__ import main
-from sb3_flowpolicy.coordination.families import FAMILIES, INDEPENDENT_START, INWARDS
-from sb3_flowpolicy.coordination.search import measure, predict, setting_of
+from sb3_flowpolicy.experiments.coordination.__main__ import main
+from sb3_flowpolicy.experiments.coordination.families import FAMILIES, INDEPENDENT_START, INWARDS
+from sb3_flowpolicy.experiments.coordination.search import measure, predict, setting_of
 
 
 @pytest.mark.parametrize("name", FAMILIES)

@@ -1,4 +1,4 @@
-"""`python -m sb3_flowpolicy.coordination`: how much coordinated noise is worth on a Square."""
+"""`python -m sb3_flowpolicy.experiments.coordination`: what correlated noise is worth."""
 
 from __future__ import annotations
 
@@ -35,10 +35,11 @@ holding, and, averaged over episodes after the warm-up, standard deviation of x,
 maximum distance from the middle, and the share of episodes in which the goal was found."""
 _EPILOG = """\
 examples:
-  python -m sb3_flowpolicy.coordination SquareMoveX-v0
-  python -m sb3_flowpolicy.coordination SquareMoveX-v0 --set max_force=2.4 --task effort=0.1 angle=1
-  python -m sb3_flowpolicy.coordination SquareHold-v0 --ent-coef 0.15 --modes
-  python -m sb3_flowpolicy.coordination SquareFindGoal-v0 --budget 1000 --json prediction.json
+  coordination SquareMoveX-v1
+  coordination SquareMoveX-v1 --set max_force=2.4 --task effort=0.1 angle=1
+  coordination SquareHold-v1 --ent-coef 0.15 --modes
+  coordination SquareFindGoal-v1 --budget 1000 --json prediction.json
+each after `python -m sb3_flowpolicy.experiments.`
 
 With the default budget, a family takes about half a minute on one core. The objective is noisy:
 compare searches with other --seed values before you rely on a small difference."""
@@ -51,7 +52,7 @@ _HEAD = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m sb3_flowpolicy.coordination",
+        prog="python -m sb3_flowpolicy.experiments.coordination",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from tqdm import tqdm
 
         from sb3_flowpolicy.common.files import write_json
-        from sb3_flowpolicy.coordination.search import predict, setting_of
+        from sb3_flowpolicy.experiments.coordination.search import predict, setting_of
     except ModuleNotFoundError as error:
         parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
 
