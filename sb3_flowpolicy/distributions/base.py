@@ -11,6 +11,8 @@ from torch import nn
 from sb3_flowpolicy.common.validation import integer
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+# Of one coordinate, in nats.
+STANDARD_NORMAL_ENTROPY = 0.5 + LOG_SQRT_2PI
 # Log-densities and gradients fit into float32 up to this many standard deviations from the mean.
 FARTHEST = 1e12
 
@@ -73,6 +75,23 @@ class ActionDistribution(nn.Module, ABC):
         _check_last_dim("context", context, self.context_dim)
         return self._mode(context)
 
+    def entropy(self, context: th.Tensor) -> th.Tensor | None:
+        """Return the entropy in nats, shape (...), or None where it has no closed form."""
+        _check_last_dim("context", context, self.context_dim)
+        return self._entropy(context)
+
+    def shrink_heads(self, gain: float = 0.01) -> None:
+        """Reinitialize such that the density hardly depends on the context: on-policy algorithms.
+
+        Weights of the layers that read the context become orthogonal with a small gain, biases
+        zero, as in the last layer of SB3's on-policy policies. Override it where another start
+        is better.
+        """
+        for module in self.children():
+            if isinstance(module, nn.Linear):
+                nn.init.orthogonal_(module.weight, gain)
+                nn.init.zeros_(module.bias)
+
     def draw_noise(self, context: th.Tensor, *sample_shape: int) -> th.Tensor:
         """Draw standard normal noise for ``context``, shape (sample_shape, ..., M)."""
         shape = (*sample_shape, *context.shape[:-1], self.noise_dim)
@@ -88,6 +107,9 @@ class ActionDistribution(nn.Module, ABC):
 
     @abstractmethod
     def _mode(self, context: th.Tensor) -> th.Tensor: ...
+
+    def _entropy(self, context: th.Tensor) -> th.Tensor | None:
+        return None
 
 
 def standard_normal_log_prob(noise: th.Tensor) -> th.Tensor:

@@ -191,6 +191,9 @@ class CouplingFlow(ActionDistribution):
                 nn.init.zeros_(coupling.last.weight)
                 nn.init.zeros_(coupling.last.bias)
 
+    def shrink_heads(self, gain: float = 0.01) -> None:
+        """Do nothing: ``init`` says how the flow starts, by default as the identity."""
+
     def _through(
         self, context: th.Tensor, value: th.Tensor, log_prob: th.Tensor, inverse: bool
     ) -> tuple[th.Tensor, th.Tensor]:

@@ -7,6 +7,7 @@ from torch import nn
 
 from sb3_flowpolicy.distributions.base import (
     FARTHEST,
+    STANDARD_NORMAL_ENTROPY,
     score_standard_normal,
     soft_bound,
     standard_normal_log_prob,
@@ -82,3 +83,7 @@ class FullCovarianceGaussian(DiagGaussian):
             lower.double(), scaled.double().unsqueeze(-1), upper=False, unitriangular=True
         ).squeeze(-1)
         return score_standard_normal(noise).to(scaled) - log_diag.sum(-1)
+
+    def _entropy(self, context: th.Tensor) -> th.Tensor | None:
+        _, _, log_diag = self.factors(context)
+        return log_diag.sum(-1) + self.action_dim * STANDARD_NORMAL_ENTROPY

@@ -6,6 +6,7 @@ import torch as th
 from torch import nn
 
 from sb3_flowpolicy.distributions.base import (
+    STANDARD_NORMAL_ENTROPY,
     ActionDistribution,
     score_standard_normal,
     standard_normal_log_prob,
@@ -14,6 +15,14 @@ from sb3_flowpolicy.distributions.base import (
 # SB3's bounds, so that a stock SAC actor and ours are the same function.
 LOG_STD_MIN = -20.0
 LOG_STD_MAX = 2.0
+
+
+class LogStdHead(nn.Linear):
+    """Linear layer for the log standard deviation, clamped as SB3's SAC does."""
+
+    def forward(self, context: th.Tensor) -> th.Tensor:
+        """Return the log standard deviation, shape (..., D)."""
+        return super().forward(context).clamp(LOG_STD_MIN, LOG_STD_MAX)
 
 
 class DiagGaussian(ActionDistribution):
@@ -37,12 +46,12 @@ class DiagGaussian(ActionDistribution):
 
     def __init__(self, action_dim: int, context_dim: int) -> None:
         super().__init__(action_dim, context_dim)
-        self.mu = nn.Linear(context_dim, action_dim)
-        self.log_std = nn.Linear(context_dim, action_dim)
+        self.mu: nn.Module = nn.Linear(context_dim, action_dim)
+        self.log_std: nn.Module = LogStdHead(context_dim, action_dim)
 
     def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return the mean and the clamped log standard deviation, both of shape (..., D)."""
-        return self.mu(context), self.log_std(context).clamp(LOG_STD_MIN, LOG_STD_MAX)
+        """Return the mean and the log standard deviation, both of shape (..., D)."""
+        return self.mu(context), self.log_std(context)
 
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
@@ -57,3 +66,6 @@ class DiagGaussian(ActionDistribution):
 
     def _mode(self, context: th.Tensor) -> th.Tensor:
         return self.mu(context)
+
+    def _entropy(self, context: th.Tensor) -> th.Tensor | None:
+        return self.log_std(context).sum(-1) + self.action_dim * STANDARD_NORMAL_ENTROPY

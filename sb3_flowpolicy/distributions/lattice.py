@@ -8,6 +8,7 @@ from torch import nn
 from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.distributions.base import (
     FARTHEST,
+    STANDARD_NORMAL_ENTROPY,
     score_standard_normal,
     soft_bound,
     standard_normal_log_prob,
@@ -18,6 +19,14 @@ from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 # float64 for the Cholesky factor of the covariance. The upper bound is SB3's.
 LOG_STD_MIN = -10.0
 LOG_STD_MAX = 2.0
+
+
+class SoftLogStdHead(nn.Linear):
+    """Linear layer for log standard deviations in (LOG_STD_MIN, LOG_STD_MAX)."""
+
+    def forward(self, context: th.Tensor) -> th.Tensor:
+        """Return the bounded log standard deviations, shape (..., outputs)."""
+        return _bounded(super().forward(context))
 
 
 class Lattice(DiagGaussian):
@@ -63,15 +72,12 @@ class Lattice(DiagGaussian):
     def __init__(self, action_dim: int, context_dim: int, alpha: float = 1.0) -> None:
         super().__init__(action_dim, context_dim)
         self.alpha = number(0)("alpha", alpha)
-        self.latent_log_std = nn.Linear(context_dim, context_dim)
-
-    def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return the mean and the log standard deviation of the noise of the actions, (..., D)."""
-        return self.mu(context), _bounded(self.log_std(context))
+        self.log_std = SoftLogStdHead(context_dim, action_dim)
+        self.latent_log_std = SoftLogStdHead(context_dim, context_dim)
 
     def scale_tril(self, context: th.Tensor, log_std: th.Tensor) -> th.Tensor:
         """Return the Cholesky factor of the covariance, shape (..., D, D), in float64."""
-        latent_variance = (2 * _bounded(self.latent_log_std(context)).double()).exp()
+        latent_variance = (2 * self.latent_log_std(context).double()).exp()
         weight = self.alpha * self.mu.weight.double()
         # The products of the rows of W make the whole covariance a single matrix product.
         pairs = (weight.unsqueeze(0) * weight.unsqueeze(1)).flatten(0, 1)
@@ -100,6 +106,10 @@ class Lattice(DiagGaussian):
         distance = (value - loc).double().clamp(-FARTHEST, FARTHEST)
         noise = th.linalg.solve_triangular(lower, distance.unsqueeze(-1), upper=False).squeeze(-1)
         return (score_standard_normal(noise) - _half_log_det(lower)).to(value)
+
+    def _entropy(self, context: th.Tensor) -> th.Tensor | None:
+        half_log_det = _half_log_det(self.scale_tril(context, self.log_std(context)))
+        return half_log_det.to(context) + self.action_dim * STANDARD_NORMAL_ENTROPY
 
 
 def _bounded(log_std: th.Tensor) -> th.Tensor:

@@ -6,7 +6,12 @@ import torch as th
 from torch import nn
 
 from sb3_flowpolicy.common.validation import integer
-from sb3_flowpolicy.distributions.base import FARTHEST, LOG_SQRT_2PI, soft_bound
+from sb3_flowpolicy.distributions.base import (
+    FARTHEST,
+    LOG_SQRT_2PI,
+    STANDARD_NORMAL_ENTROPY,
+    soft_bound,
+)
 from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
 # tanh(3) = 0.995: with this bound a single column of V spans the whole action box.
@@ -79,10 +84,27 @@ class LowRankGaussian(DiagGaussian):
         hidden = th.cat([scaled, scaled.new_zeros(*scaled.shape[:-1], self.rank)], dim=-1)
         return self._density(log_std, columns, hidden)
 
+    def _entropy(self, context: th.Tensor) -> th.Tensor | None:
+        _, log_std, columns = self.covariance_factors(context)
+        half_log_det, _ = self._decompose(log_std, columns)
+        return half_log_det + self.action_dim * STANDARD_NORMAL_ENTROPY
+
     def _density(
         self, log_std: th.Tensor, columns: tuple[th.Tensor, ...], hidden: th.Tensor
     ) -> th.Tensor:
-        """Project ``hidden`` off the column space of [V / sigma; I] by modified Gram-Schmidt."""
+        half_log_det, basis = self._decompose(log_std, columns)
+        for direction in basis:
+            hidden = hidden - (hidden * direction).sum(-1, keepdim=True) * direction
+        mahalanobis = hidden.square().sum(-1)
+        return -0.5 * mahalanobis - half_log_det - self.action_dim * LOG_SQRT_2PI
+
+    def _decompose(
+        self, log_std: th.Tensor, columns: tuple[th.Tensor, ...]
+    ) -> tuple[th.Tensor, list[th.Tensor]]:
+        """Return half of log det Sigma and a basis of the columns of [V / sigma; I].
+
+        The basis comes from modified Gram-Schmidt.
+        """
         inv_std = (-log_std).exp()
         identity = th.eye(self.rank, dtype=log_std.dtype, device=log_std.device)
         basis: list[th.Tensor] = []
@@ -94,7 +116,4 @@ class LowRankGaussian(DiagGaussian):
             norm = rest.norm(dim=-1, keepdim=True)
             basis.append(rest / norm)
             half_log_det = half_log_det + norm.squeeze(-1).log()
-        for direction in basis:
-            hidden = hidden - (hidden * direction).sum(-1, keepdim=True) * direction
-        mahalanobis = hidden.square().sum(-1)
-        return -0.5 * mahalanobis - half_log_det - self.action_dim * LOG_SQRT_2PI
+        return half_log_det, basis

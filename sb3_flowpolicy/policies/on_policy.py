@@ -12,7 +12,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_flowpolicy.common.validation import flag, number
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.distributions.gaussian import LogStdHead
+from sb3_flowpolicy.distributions.loc_scale import StateIndependent, with_heads
 from sb3_flowpolicy.policies.base import (
     DensityPolicy,
     check_action_space,
@@ -22,8 +25,8 @@ from sb3_flowpolicy.policies.base import (
 )
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
 
-# Arguments of SB3's Gaussian head, which is not built.
-_UNUSED = {"use_sde", "log_std_init", "full_std", "use_expln", "squash_output"}
+# Arguments of SB3's gSDE, which is not built.
+_UNUSED = {"use_sde", "full_std", "use_expln", "squash_output"}
 # Bound on the gradient of the loss with respect to a log-probability, which in PPO is advantage
 # times ratio. A larger gradient only says that the policy has left the actions it is judged by.
 _LARGEST_GRADIENT = 1e6
@@ -32,10 +35,16 @@ _LARGEST_GRADIENT = 1e6
 class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
     """Actor-critic policy with a registered density as its action distribution.
 
+    It starts as SB3's policy does: the mean comes from SB3's linear layer (orthogonal weights of
+    gain 0.01 unless ``ortho_init=False``), the standard deviation is a parameter, and the density's
+    shape (a flow, or the correlations of a Gaussian) starts as the identity or close to it.
+    A flow stands between the noise and this location and scale.
+
     Both while collecting and while learning, the log-probability of an action is computed with the
     density's inverse from the numbers in the rollout buffer. So PPO's ratio is 1 before the first
     update, even for saturated actions (up to rounding, which flows with extreme weights amplify).
-    The entropy bonus is a Monte Carlo estimate whose gradient reaches all parameters.
+    The entropy is exact for Gaussians that are not squashed, and otherwise an estimate whose
+    gradient reaches all parameters.
 
     Args:
         observation_space: As for SB3's policy classes.
@@ -44,12 +53,15 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         distribution: Name of a registered density. Default: that of the policy class.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
         squash_output: Whether to squash actions with tanh and rescale them to the action space.
-            Otherwise they are clipped to it, as SB3 does by default.
+            Otherwise they are clipped to it, as in SB3.
+        log_std_init: Initial log standard deviation, of the unsquashed action.
+        state_dependent_std: Whether the standard deviation depends on the observation. The
+            bounds of its logarithm are then those of SB3's SAC, -20 and 2.
         **policy_kwargs: Other arguments of SB3's ``ActorCriticPolicy``.
 
     Raises:
         ValueError: If the action space is not a Box (with finite bounds), the density is unknown,
-            or an argument belongs to SB3's Gaussian head (``use_sde=True``, ``log_std_init``, ...).
+            or an argument belongs to SB3's gSDE (``use_sde=True``, ``full_std``, ...).
 
     References:
         Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5, which
@@ -64,7 +76,9 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         *,
         distribution: str | None = None,
         distribution_kwargs: Mapping[str, Any] | None = None,
-        squash_output: bool = True,
+        squash_output: bool = False,
+        log_std_init: float = 0.0,
+        state_dependent_std: bool = False,
         use_sde: bool = False,
         **policy_kwargs: Any,
     ) -> None:
@@ -72,8 +86,8 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         unused = sorted(policy_kwargs.keys() & _UNUSED)
         if use_sde or unused:
             raise ValueError(
-                "use_sde must be False and policy_kwargs must not have arguments of SB3's Gaussian "
-                f"head, which the density replaces, got use_sde={use_sde} and {unused}"
+                "use_sde must be False and policy_kwargs must not have arguments of SB3's gSDE, "
+                f"which the density replaces, got use_sde={use_sde} and {unused}"
             )
         net_arch = policy_kwargs.get("net_arch")
         if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], Mapping):
@@ -81,16 +95,24 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         check_net_arch(net_arch, set(), {"pi", "vf"})
         self._set_density(observation_space, policy_kwargs, distribution, distribution_kwargs)
         self._squashes = squash_output
+        self.state_dependent_std = flag("state_dependent_std", state_dependent_std)
+        policy_kwargs["log_std_init"] = number(-20, 20)("log_std_init", log_std_init)
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
         # SB3's constructor accepts squash_output with gSDE only, but the rest of SB3 supports it.
         self._squash_output = squash_output
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        # The density replaces the Gaussian head that SB3 has built.
-        del self.log_std
         size, features = spaces.flatdim(self.action_space), self.mlp_extractor.latent_dim_pi
         density = make_distribution(self.distribution, size, features, **self.distribution_kwargs)
+        # The location and the scale are the layer and the parameter that SB3 has initialized.
+        log_std: nn.Module = StateIndependent(self.log_std)
+        if self.state_dependent_std:
+            log_std = LogStdHead(features, size)
+            nn.init.orthogonal_(log_std.weight, 0.01)
+            nn.init.constant_(log_std.bias, self.log_std_init)
+        density = with_heads(density, self.action_net, log_std)
+        del self.log_std
         density = TanhSquashed(density) if self._squashes else density
         self.action_net: nn.Module = density.to(self.device)
         self.action_dist = ActionDistributionAdapter(density)
@@ -123,12 +145,28 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         used = {name: value for name, value in data.items() if name not in _UNUSED}
-        return {**used, "squash_output": self._squashes}
+        return {
+            **used,
+            "squash_output": self._squashes,
+            "state_dependent_std": self.state_dependent_std,
+        }
 
 
 def _bounded(gradient: th.Tensor) -> th.Tensor:
     """Bound a gradient. NaN, which is 0 times infinity for a ratio that PPO clipped, becomes 0."""
     return gradient.nan_to_num(nan=0.0).clamp(-_LARGEST_GRADIENT, _LARGEST_GRADIENT)
+
+
+class GaussActorCriticPolicy(DensityActorCritic):
+    """Diagonal normal distribution for PPO and A2C, the policy of stock PPO.
+
+    Example:
+        >>> from stable_baselines3 import PPO
+        >>> kwargs = dict(distribution="full_covariance", log_std_init=-1.0)
+        >>> model = PPO(GaussActorCriticPolicy, "Pendulum-v1", policy_kwargs=kwargs)
+    """
+
+    default_distribution = "gaussian"
 
 
 class FlowActorCriticPolicy(DensityActorCritic):
@@ -150,7 +188,7 @@ class LowRankActorCriticPolicy(DensityActorCritic):
 
     Example:
         >>> from stable_baselines3 import A2C
-        >>> kwargs = dict(distribution_kwargs=dict(rank=1), squash_output=False)
+        >>> kwargs = dict(distribution_kwargs=dict(rank=1), squash_output=True)
         >>> model = A2C(LowRankActorCriticPolicy, "Pendulum-v1", policy_kwargs=kwargs)
     """
 
@@ -158,5 +196,8 @@ class LowRankActorCriticPolicy(DensityActorCritic):
 
 
 ALIASES = with_forms(
-    globals(), FlowPolicy=FlowActorCriticPolicy, LowRankPolicy=LowRankActorCriticPolicy
+    globals(),
+    FlowPolicy=FlowActorCriticPolicy,
+    LowRankPolicy=LowRankActorCriticPolicy,
+    GaussPolicy=GaussActorCriticPolicy,
 )

@@ -6,6 +6,7 @@ import torch as th
 from stable_baselines3.common.distributions import Distribution
 
 from sb3_flowpolicy.distributions import ActionDistribution
+from sb3_flowpolicy.distributions.base import STANDARD_NORMAL_ENTROPY, standard_normal_log_prob
 
 # PPO averages the entropy over a minibatch, so a few samples per observation are enough.
 ENTROPY_PAIRS = 2
@@ -45,14 +46,20 @@ class ActionDistributionAdapter(Distribution):
         return self.density.log_prob(self.context, actions)
 
     def entropy(self) -> th.Tensor:
-        """Estimate the entropy by Monte Carlo, with gradient: shape (batch,).
+        """Return the entropy, or an estimate with gradient: shape (batch,).
 
-        Squashed densities and flows have no closed form. Noise is drawn in pairs of opposite sign,
-        which cancels the terms of the error that are odd in it.
+        Squashed densities and flows have no closed form. Their entropy is that of the noise, which
+        is known, plus the expected log-determinant, which is estimated. Noise is drawn in pairs of
+        opposite sign, which cancels the terms of the error that are odd in it.
         """
+        exact = self.density.entropy(self.context)
+        if exact is not None:
+            return exact
         noise = self.density.draw_noise(self.context, ENTROPY_PAIRS)
         noise = th.cat([noise, -noise])
-        return -self.density.rsample_and_log_prob(self.context, noise)[1].mean(0)
+        log_prob = self.density.rsample_and_log_prob(self.context, noise)[1]
+        ladj = standard_normal_log_prob(noise) - log_prob
+        return self.density.noise_dim * STANDARD_NORMAL_ENTROPY + ladj.mean(0)
 
     def sample(self) -> th.Tensor:
         """Draw a reparametrized sample, shape (batch, D)."""
