@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch as th
 from torch import nn
 
@@ -44,10 +46,12 @@ class DiagGaussian(ActionDistribution):
         (torch.Size([5, 2]), torch.Size([5]))
     """
 
+    log_std_head: ClassVar[type[nn.Module]] = LogStdHead
+
     def __init__(self, action_dim: int, context_dim: int) -> None:
         super().__init__(action_dim, context_dim)
         self.mu: nn.Module = nn.Linear(context_dim, action_dim)
-        self.log_std: nn.Module = LogStdHead(context_dim, action_dim)
+        self.log_std: nn.Module = self.log_std_head(context_dim, action_dim)
 
     def loc_and_log_std(self, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the mean and the log standard deviation, both of shape (..., D)."""

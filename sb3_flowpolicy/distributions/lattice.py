@@ -69,10 +69,11 @@ class Lattice(DiagGaussian):
         True
     """
 
+    log_std_head = SoftLogStdHead
+
     def __init__(self, action_dim: int, context_dim: int, alpha: float = 1.0) -> None:
         super().__init__(action_dim, context_dim)
         self.alpha = number(0)("alpha", alpha)
-        self.log_std = SoftLogStdHead(context_dim, action_dim)
         self.latent_log_std = SoftLogStdHead(context_dim, context_dim)
 
     def scale_tril(self, context: th.Tensor, log_std: th.Tensor) -> th.Tensor:

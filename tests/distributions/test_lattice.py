@@ -15,7 +15,7 @@ from tests.distributions.conftest import CONTEXT_DIM, DIMS, build
 
 def stds(density: Lattice, context: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Standard deviations of the noise of features and of actions."""
-    latent = _bounded(density.latent_log_std(context)).exp()
+    latent = density.latent_log_std(context).exp()
     return density.alpha * latent, density.loc_and_log_std(context)[1].exp()
 
 
