@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the names of _MODULES once more, for type checkers and edit
     from sb3_flowpolicy.guard import NonFiniteError as NonFiniteError
     from sb3_flowpolicy.policies.crossq import FlowCrossQPolicy as FlowCrossQPolicy
     from sb3_flowpolicy.policies.on_policy import FlowActorCriticPolicy as FlowActorCriticPolicy
+    from sb3_flowpolicy.policies.on_policy import GaussActorCriticPolicy as GaussActorCriticPolicy
     from sb3_flowpolicy.policies.on_policy import (
         LowRankActorCriticPolicy as LowRankActorCriticPolicy,
     )
@@ -49,6 +50,7 @@ _MODULES = {
     "NonFiniteError": "guard",
     "FlowCrossQPolicy": "policies.crossq",
     "FlowActorCriticPolicy": "policies.on_policy",
+    "GaussActorCriticPolicy": "policies.on_policy",
     "LowRankActorCriticPolicy": "policies.on_policy",
     "CnnFlowPolicy": "policies.sac",
     "FlowPolicy": "policies.sac",

@@ -47,8 +47,8 @@ class PPOFlow(PPO):
     SB3's :class:`~stable_baselines3.PPO` with additional policy aliases.
 
     Args:
-        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, their ``Cnn...`` and
-            ``MultiInput...`` forms, or a policy class.
+        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``, their
+            ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of PPO, in its order.
         **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that

@@ -48,15 +48,16 @@ CANDIDATES: dict[str, tuple[Any, dict[str, Any]]] = {
             "flow": crossq.FlowCrossQPolicy,
         },
     ),
-    # The "-clipped" policies bound actions as SB3's PPO does, the others squash them.
+    # The "-squashed" policies bound actions by tanh, the others clip them as SB3's PPO does.
     "ppo": (
         PPO,
         {
             "stock": "MlpPolicy",
+            "gauss": on_policy.GaussActorCriticPolicy,
             "lowrank": on_policy.LowRankActorCriticPolicy,
             "flow": on_policy.FlowActorCriticPolicy,
-            "lowrank-clipped": on_policy.LowRankActorCriticPolicy,
-            "flow-clipped": on_policy.FlowActorCriticPolicy,
+            "lowrank-squashed": on_policy.LowRankActorCriticPolicy,
+            "flow-squashed": on_policy.FlowActorCriticPolicy,
         },
     ),
 }
@@ -137,8 +138,8 @@ def train(task: Task, algorithm: str, policy: str, seed: int, n_episodes: int) -
     settings = dict(task.settings[algorithm])
     count, normalize = settings.pop("n_envs", 1), settings.pop("normalize", False)
     policy_kwargs = dict(settings.pop("policy_kwargs", {}))
-    if policy.endswith("-clipped"):
-        policy_kwargs["squash_output"] = False
+    if policy.endswith("-squashed"):
+        policy_kwargs["squash_output"] = True
     venv = make_vec_env(task.env_id, count, seed, env_kwargs=task.env_kwargs)
     test_venv = make_vec_env(task.env_id, 1, 10**6 + seed, env_kwargs=task.env_kwargs)
     if normalize:

@@ -32,7 +32,8 @@ def test_runs_are_recorded_and_not_repeated(
     rows = list(csv.DictReader(table.open()))
     runs = {(row["algorithm"], row["policy"]) for row in rows}
     assert runs == {("tqc", name) for name in ("stock", "gauss", "lowrank", "flow")} | {
-        ("ppo", name) for name in ("stock", "lowrank", "flow", "lowrank-clipped", "flow-clipped")
+        ("ppo", name)
+        for name in ("stock", "gauss", "lowrank", "flow", "lowrank-squashed", "flow-squashed")
     }
     assert len(rows) == 6 * len(runs)
     assert [int(row["step"]) for row in rows[:6]] == [16, 32, 48, 64, 80, 96]

@@ -52,7 +52,7 @@ def test_every_block_is_ready_to_run(algorithm):
         # PyYAML reads 3e-4, without a point, as text; rl_zoo3 reads text as a schedule.
         text = {key for key, value in block.items() if isinstance(value, str)}
         schedules = {key for key in text if block[key].startswith("lin_")}
-        assert text - schedules <= {"policy", "ent_coef", "callback"}, env_id
+        assert text - schedules <= {"policy", "policy_kwargs", "ent_coef", "callback"}, env_id
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
