@@ -347,6 +347,6 @@ def test_bad_spaces_and_gsde() -> None:
 def test_it_learns(policy: type[ActorCriticPolicy]) -> None:
     """The reward is the sum of the actions, so the upper corner is best."""
     model = PPO(policy, Box2D(), n_steps=256, batch_size=128, learning_rate=1e-2, seed=0)
-    model.learn(2048)
+    model.learn(3072)
     action = model.predict(np.zeros((1, 3), np.float32), deterministic=True)[0]
-    assert action.sum() > 3  # the maximum is 10, the middle of the box -1
+    assert action.sum() > 2  # it starts at 0; the maximum is 10
