@@ -26,8 +26,10 @@ from sb3_flowpolicy.algorithms.demonstrations import (
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
 from sb3_flowpolicy.common.validation import check_settings, either, flag, number, optional
-from sb3_flowpolicy.engine import LOSSES, EngineRuntime
+from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
+from sb3_flowpolicy.guard.finite import check_observation
 from sb3_flowpolicy.policies import sac
+from sb3_flowpolicy.policies.base import check_finite
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 # SB3 halves the squared error, spinningup (and the thesis) does not.
@@ -211,6 +213,44 @@ class SACFlow(OffPolicyFlow, SAC):
         """Train; the arguments are those of :meth:`OffPolicyFlow.learn`."""
         with self._runtime.running(watched=callback is not None):
             return super().learn(total_timesteps, callback, *args, **kwargs)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions, as in SB3.
+
+        While the model learns with a compiled policy, callbacks such as ``EvalCallback`` act with
+        it, too, if they evaluate as many environments at once as the model learns from.
+        """
+        if self._runtime.is_running and isinstance(observation, np.ndarray):
+            engine = self._runtime.engine()
+            if engine is not None and engine.compiled:
+                obs, is_batch = self.policy.obs_to_tensor(observation)
+                check_observation(observation)
+                scaled = self._act_compiled(engine, obs, deterministic)
+                if scaled is not None:
+                    check_finite(scaled)
+                    actions = self.policy.unscale_action(scaled)
+                    return (actions if is_batch else actions.squeeze(axis=0)), state
+        return super().predict(observation, state, episode_start, deterministic)
+
+    def _act_compiled(
+        self, engine: Engine, obs: th.Tensor, deterministic: bool
+    ) -> np.ndarray | None:
+        """Return scaled actions, None if there is no compiled function for them."""
+        obs = obs.unsqueeze(0).contiguous()
+        base = getattr(self.policy, "deterministic_mode", "base") == "base"
+        if not engine.has_compiled_policy(obs) or (deterministic and not base):
+            return None
+        noise = None
+        if deterministic:  # the mode is the image of no noise
+            actor, shape = engine.networks.actor.data, (*obs.shape[:2], engine.networks.noise_dim)
+            noise = actor.new_zeros(shape)
+        return engine.act(obs, noise).cpu().numpy().reshape(-1, *self.action_space.shape)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.replay_buffer is None:

@@ -32,6 +32,10 @@ class Compiled:
         self._device = device
         self._graphs: dict[Hashable, Callable[..., Any]] = {}
 
+    def __contains__(self, key: Hashable) -> bool:
+        """Whether there is a graph for such calls."""
+        return key in self._graphs
+
     def __call__(self, key: Hashable, *arguments: Any) -> Any:
         """Call the function.
 

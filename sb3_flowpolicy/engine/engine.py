@@ -221,8 +221,12 @@ class Engine:
             shape = (*obs.shape[:2], self.networks.noise_dim)
             noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
         if self._runs_compiled():
-            return self._compiled_sample(obs.shape, actor, obs, noise)
+            return self._compiled_sample((obs.shape, obs.dtype), actor, obs, noise)
         return self._sample(actor, obs, noise)
+
+    def has_compiled_policy(self, obs: th.Tensor) -> bool:
+        """Whether :meth:`act` has a graph for observations of this shape and type."""
+        return self._runs_compiled() and (obs.shape, obs.dtype) in self._compiled_sample
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""

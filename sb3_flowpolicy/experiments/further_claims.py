@@ -13,7 +13,7 @@ from sb3_flowpolicy.experiments.experiment import (
 )
 
 _GAUSS_AND_FLOW = (GAUSS, FLOW)
-_SQUARE_STEPS = 200_000
+_SQUARE_STEPS, _SQUARE_SEEDS = 200_000, 5
 
 
 def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:
@@ -51,7 +51,7 @@ FURTHER_CLAIMS = (
         title="Hold the square, fixed entropy coefficient: does NF keep more entropy?",
         thesis="NF holds over a nat more entropy, with a slightly better training return and a "
         "similar test return.",
-        settings=(Setting("hold", "SquareHold-v0"),),
+        settings=(Setting("hold", "SquareHold-v1"),),
         agents=_GAUSS_AND_FLOW,
         checks=(
             ordered("hold", "entropy", (FLOW, GAUSS), 1.0),
@@ -59,6 +59,7 @@ FURTHER_CLAIMS = (
             about_equal("hold", "test_return", _GAUSS_AND_FLOW, 0.1),
         ),
         steps=_SQUARE_STEPS,
+        seeds=_SQUARE_SEEDS,
         eval_every=4000,
     ),
     Experiment(
@@ -70,7 +71,7 @@ FURTHER_CLAIMS = (
         settings=tuple(
             Setting(
                 f"target-{-target}",
-                "SquareHold-v0",
+                "SquareHold-v1",
                 overrides={"ent_coef": "auto", "target_entropy": float(target)},
             )
             for target in (-2, -8)
@@ -81,6 +82,7 @@ FURTHER_CLAIMS = (
             about_equal("target-8", "train_return", _GAUSS_AND_FLOW, 0.1),
         ),
         steps=_SQUARE_STEPS,
+        seeds=_SQUARE_SEEDS,
         eval_every=4000,
     ),
     Experiment(
@@ -89,9 +91,10 @@ FURTHER_CLAIMS = (
         source="section 3.3.3, figure 3.17",
         title="Hold the square and move: correlation of the actions",
         thesis="NF's actions of the same axis are clearly correlated, LR's less, Gauss's not.",
-        settings=(Setting("move", "SquareMove-v0"),),
+        settings=(Setting("move", "SquareMove-v1"),),
         checks=(ordered("move", "same_axis_correlation", (FLOW, LOW_RANK, GAUSS)),),
         steps=_SQUARE_STEPS,
+        seeds=_SQUARE_SEEDS,
         eval_every=4000,
         measures=("same_axis_correlation",),
     ),
@@ -102,14 +105,15 @@ FURTHER_CLAIMS = (
         title="Hold the square and move along x only: how far do the agents move?",
         thesis="NF's standard deviation of x is about three times Gauss's and its greatest "
         "distance about twice, LR lies between.",
-        settings=(Setting("move-x", "SquareMoveX-v0"),),
+        settings=(Setting("move-x", "SquareMoveX-v1"),),
         checks=(
             at_least_times("move-x", "x_std", FLOW, GAUSS, 2.0),
             at_least_times("move-x", "x_max", FLOW, GAUSS, 1.5),
             ordered("move-x", "x_std", (FLOW, LOW_RANK, GAUSS)),
         ),
-        steps=1_500_000,
-        eval_every=30_000,
+        steps=1_000_000,
+        seeds=3,
+        eval_every=20_000,
         measures=("same_axis_correlation", "x_std", "x_max"),
         notes="In the thesis the agents differ after about 1.5 million steps.",
     ),
@@ -120,10 +124,11 @@ FURTHER_CLAIMS = (
         title="Find a hidden goal: how often does each agent find it while exploring?",
         thesis="Holding still finds the goal in about a fifth of the episodes. Gauss stays near "
         "that, NF rises above it.",
-        settings=(Setting("find-goal", "SquareFindGoal-v0"),),
+        settings=(Setting("find-goal", "SquareFindGoal-v1"),),
         agents=_GAUSS_AND_FLOW,
         checks=(ordered("find-goal", "train_success", (FLOW, GAUSS), 0.05),),
         steps=_SQUARE_STEPS,
+        seeds=_SQUARE_SEEDS,
         eval_every=4000,
     ),
 )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
@@ -240,3 +241,58 @@ def test_replay_columns_stay_what_sb3_can_train_with() -> None:
     assert model.replay_buffer is not None
     assert model.replay_buffer.rewards.dtype == model.replay_buffer.actions.dtype == np.float32
     model._train_with_sb3(1, 8)
+
+
+class ActInCallback(BaseCallback):
+    """Compares the model with its policy, which acts eagerly, once the policy is compiled."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.compared = 0
+
+    def _on_step(self) -> bool:
+        assert isinstance(self.model, SACFlow)
+        if self.num_timesteps < 30:
+            return True
+        if self.num_timesteps == 35:  # other weights have to be noticed
+            for parameter in self.model.actor.parameters():
+                parameter.data.add_(0.1)
+        rng = np.random.default_rng(self.num_timesteps)
+        one = rng.normal(size=3).astype(np.float32)
+        for obs in (one, one[None], one.astype(np.float64), np.stack([one, -one])):
+            for deterministic in (True, False):
+                th.manual_seed(0)
+                got, _ = self.model.predict(obs, deterministic=deterministic)
+                th.manual_seed(0)
+                expected, _ = self.model.policy.predict(obs, deterministic=deterministic)
+                assert got.shape == expected.shape
+                np.testing.assert_allclose(got, expected, rtol=0, atol=1e-5)
+        with pytest.raises(ValueError, match=r"observation .*must be finite"):
+            self.model.predict(np.full(3, np.nan, np.float32))
+        self.compared += 1
+        return True
+
+
+@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+@pytest.mark.parametrize("mode", ["base", "log_prob"])
+def test_callbacks_act_with_the_compiled_policy(
+    policy: str, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    acted: list[tuple[int, ...]] = []
+    act = Engine.act
+
+    def count(self: Engine, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
+        acted.append(tuple(obs.shape))
+        return act(self, obs, noise)
+
+    monkeypatch.setattr(Engine, "act", count)
+    # The function itself in place of its graph: compiling is not what is tested here.
+    monkeypatch.setattr(th, "compile", lambda function, **_: function)
+    settings = {"policy_kwargs": {"net_arch": [8], "deterministic_mode": mode}, "batch_size": 4}
+    model = SACFlow(policy, "Pendulum-v1", learning_starts=20, compile=True, seed=0, **settings)
+    callback = ActInCallback()
+    model.learn(40, callback=callback)
+    assert callback.compared == 11
+    # Twenty steps of experience; per callback, two shapes of one observation, sampled and not.
+    per_callback = 4 if mode == "base" else 2
+    assert acted == [(1, 1, 3)] * (20 + 11 * per_callback)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from flowpolicy_envs.registration import SQUARE_IDS
 from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.batch import SquareBatch
 from flowpolicy_envs.square.config import DIRECTIONS, SquareConfig
@@ -10,6 +11,9 @@ from flowpolicy_envs.square.config import DIRECTIONS, SquareConfig
 PLACES = 0.4 * DIRECTIONS
 INWARDS = -DIRECTIONS.ravel()
 DT = 0.01
+V1 = {k: v for k, v in SQUARE_IDS["SquareMove-v1"].items() if k not in ("task", "warm_up")}
+# Fingers as strong as in `SquareHold-v0` keep the square away from the walls of the world.
+RULES = pytest.mark.parametrize("rules", [{}, {**V1, "max_force": 6.0}], ids=["v0", "v1"])
 STILL = {"finger_noise": 0.0, "start_x": 0.0, "start_y": 0.0, "start_angle": 0.0}
 
 
@@ -69,9 +73,10 @@ class World:
         return float((0.5 * stiffness * bounded**2 + limit * (stretch - bounded)).sum())
 
 
-def test_contact_never_creates_energy():
+@RULES
+def test_contact_never_creates_energy(rules):
     """Without controllers, fingers never accelerate the square."""
-    rng, world = np.random.default_rng(0), World(kp=0.0)
+    rng, world = np.random.default_rng(0), World(**{**rules, "kp": 0.0})
     world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]] = 0.0
     touched = 0
     for _ in range(1500):
@@ -84,9 +89,10 @@ def test_contact_never_creates_energy():
     assert touched > 5000
 
 
-def test_controllers_release_no_more_than_they_stored():
+@RULES
+def test_controllers_release_no_more_than_they_stored(rules):
     """With constant targets, the sum of kinetic and stored energy never grows."""
-    rng, world = np.random.default_rng(1), World()
+    rng, world = np.random.default_rng(1), World(**rules)
     world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]] = 0.0
     for _ in range(1500):
         world.randomise(rng)
@@ -97,8 +103,9 @@ def test_controllers_release_no_more_than_they_stored():
             assert after <= before * (1 + 1e-12)
 
 
-def test_momentum_changes_by_contact_forces_and_damping():
-    rng, world = np.random.default_rng(2), World()
+@RULES
+def test_momentum_changes_by_contact_forces_and_damping(rules):
+    rng, world = np.random.default_rng(2), World(**rules)
     mass, inertia = world.constants[[kernels.MASS, kernels.INERTIA]]
     linear, angular = world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]]
     for _ in range(300):
@@ -139,14 +146,16 @@ def test_fingers_feel_the_reaction():
     assert checked > 200
 
 
-def test_fingers_stay_outside():
-    rng, world = np.random.default_rng(3), World()
+@RULES
+def test_fingers_stay_outside(rules):
+    rng, world = np.random.default_rng(3), World(**rules)
     for _ in range(300):
         world.randomise(rng)
         for _ in range(60):
             world.substep()
+            # At a corner, a finger may slip in by what a fast square moves in a substep.
             if np.abs(world.body[3:]).max() < 2.0:
-                assert world.gaps().min() > -0.01
+                assert world.gaps().min() > (-0.02 if rules else -0.01)
 
 
 def test_a_resting_grip_presses_with_the_force_of_the_controllers():
@@ -184,8 +193,9 @@ def test_nothing_is_pushed_faster_than_fingers_move():
     assert 0.9 < fastest <= 1.0 + 1e-9
 
 
-def test_a_million_random_substeps_stay_finite_and_bounded():
-    config = SquareConfig(task="move", warm_up=1e6)
+@RULES
+def test_a_million_random_substeps_stay_finite_and_bounded(rules):
+    config = SquareConfig(task="move", warm_up=1e6, **rules)
     batch = SquareBatch(config, 100)
     rng = np.random.default_rng(4)
     generators = [np.random.default_rng(n) for n in range(100)]
@@ -227,9 +237,10 @@ def trajectory(substeps: int, actions: list[np.ndarray], pose: tuple, **kwargs) 
 
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.1), (-0.03, 0.03, -0.05)])
-def test_halving_the_time_step_hardly_changes_a_trajectory(pose):
+@RULES
+def test_halving_the_time_step_hardly_changes_a_trajectory(rules, pose):
     actions = [scripted(step) for step in range(8)]
-    coarse, fine = (trajectory(n, actions, pose) for n in (25, 50))
+    coarse, fine = (trajectory(n, actions, pose, **rules) for n in (25, 50))
     coarse[:, 3:] -= PLACES.ravel()
     fine[:, 3:] -= PLACES.ravel()
     assert np.abs(coarse[:, :2]).max() > 0.1

@@ -83,13 +83,13 @@ def test_the_cone_leaves_the_whole_friction_without_tangential_force():
 
 
 def test_targets_move_linearly_during_the_slew():
-    """A free finger with stiff control follows its target, so it shows where the target is."""
-    arguments = {**STILL, "kp": 50.0, "kd": 0.4, "max_force": 50.0, "max_speed": 40.0, "mass": 10.0,
+    """A free finger stays behind a target that moves steadily."""
+    arguments = {**STILL, "kp": 25.0, "kd": 0.4, "max_force": 50.0, "max_speed": 40.0, "mass": 10.0,
                  "inertia": 1.0, "weight": 0.0, "substeps": 10}  # fmt: skip
     away = 0.5 * DIRECTIONS.ravel()
     jumped = grip(away, steps=1, **arguments).fingers
-    slewed = grip(away, steps=1, slew=0.2, **arguments).fingers
+    slewed = grip(away, steps=1, slew=0.1, **arguments).fingers
     start = 0.4 * DIRECTIONS
-    # After half of the slew the target has moved by half.
+    # A substep halves the distance to the target, which has moved by 0.02 before.
     assert np.abs(jumped - start).sum() == pytest.approx(4 * 0.2, rel=0.01)
-    assert np.abs(slewed - start).sum() == pytest.approx(4 * 0.1, rel=0.15)
+    assert np.abs(slewed - start).sum() == pytest.approx(4 * (0.2 - 0.02), rel=0.01)

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("env", metavar="ID", help="id of a Square, for example SquareMoveX-v0")
+    add("env", metavar="ID", help="id of a Square, for example SquareMoveX-v1")
     pairs: dict[str, Any] = {"nargs": "*", "type": _assignment, "default": []}
     add("--set", metavar="ARG=VALUE", help="arguments of the environment (YAML values)", **pairs)
     add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **pairs)

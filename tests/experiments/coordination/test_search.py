@@ -25,9 +25,9 @@ def test_families_begin_with_positive_definite_noise(name):
 
 def test_entropy_is_that_of_squashed_noise():
     setting = setting_of("SquareHold-v0", {}, {"warm_up": 0.0, "weight": 0.0})
-    setting = replace(setting, steps=40)
-    batch, mean, scale = SquareBatch(setting.config, 200), 0.8, 0.4
-    noise = scale * np.random.default_rng(0).standard_normal((40, 200, 8))
+    setting = replace(setting, steps=20)
+    batch, mean, scale = SquareBatch(setting.config, 400), 0.8, 0.4
+    noise = scale * np.random.default_rng(0).standard_normal((20, 400, 8))
     means = mean * INWARDS.sum(axis=0)
     found = measure(setting, means, scale * np.eye(8), noise, batch, 0).entropy
 
