@@ -1,4 +1,4 @@
-# `make train` and `make test` need nothing but Python 3.11 and make.
+# `make train` and `make test` need nothing but Python (3.10 or later) and make.
 PYTHON ?= python3
 VENV ?= .venv
 LOWEST ?= .venv-lowest

@@ -123,7 +123,7 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
             ) from error
     missing = [key for key in KEYS if key not in arrays]
     if missing:
-        raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, {missing} missing")
+        raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, got {list(arrays)}")
     arrays = {key: np.asarray(arrays[key]) for key in KEYS}
     for key, array in arrays.items():
         if array.dtype.kind not in "biuf" or not all_finite(array):

@@ -182,6 +182,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
                 another run.
             NonFiniteError: If the environment returns, or training produces, NaN or infinity.
         """
+        number(0)("total_timesteps", total_timesteps)
         with self._checkpoints.learning(checkpoint_path, checkpoint_every):
             super().learn(
                 total_timesteps,

@@ -230,6 +230,7 @@ class SACFlow(OffPolicyFlow, SAC):
             engine = self._runtime.engine()
             if engine is not None and engine.compiled:
                 obs, is_batch = self.policy.obs_to_tensor(observation)
+                assert isinstance(obs, th.Tensor)
                 check_observation(observation)
                 scaled = self._act_compiled(engine, obs, deterministic)
                 if scaled is not None:
@@ -250,7 +251,7 @@ class SACFlow(OffPolicyFlow, SAC):
         if deterministic:  # the mode is the image of no noise
             actor, shape = engine.networks.actor.data, (*obs.shape[:2], engine.networks.noise_dim)
             noise = actor.new_zeros(shape)
-        return engine.act(obs, noise).cpu().numpy().reshape(-1, *self.action_space.shape)
+        return engine.act(obs, noise).cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.replay_buffer is None:

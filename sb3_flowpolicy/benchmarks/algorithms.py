@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalizati
 from tqdm import tqdm
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.command_line import HelpFormatter
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.policies import crossq, on_policy, tqc
 
@@ -187,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description="Train TQC, CrossQ and PPO with their own policies and with ours, and write "
         "every test to a CSV file. Runs that are in the file are not repeated. Needs the extra "
         "[contrib], and [bullet] for half-cheetah.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     add = parser.add_argument
     add("--task", choices=list(TASKS), default="pendulum")

@@ -84,9 +84,9 @@ class CheckpointStore:
                 )
             self._good = [checkpoint]
             return checkpoint
-        found = f"only damaged ones ({'; '.join(damages)})" if damages else "none"
+        found = f"only damaged ones ({'; '.join(damages)})" if damages else "no checkpoint"
         raise ValueError(
-            f"path must be a folder of checkpoints, got {self.path}, which has {found}"
+            f"path must be a folder of checkpoints, got {str(self.path)!r}, which has {found}"
         )
 
     def write(

@@ -33,7 +33,8 @@ def integer(least: int, most: int = _ANY) -> Check:
 def layer_sizes(name: str, value: Any, least: int = 0) -> tuple[int, ...]:
     """Accept lists and tuples of ``least`` or more integers, each at least 1."""
     if not isinstance(value, list | tuple) or len(value) < least:
-        raise ValueError(f"{name} must be a list of layer sizes, at least {least}, got {value!r}")
+        some = "one or more layer sizes" if least else "layer sizes"
+        raise ValueError(f"{name} must be a list of {some}, got {value!r}")
     return tuple(integer(1)(name, size) for size in value)
 
 
@@ -43,9 +44,10 @@ def number(least: float = -math.inf, most: float = math.inf, above: bool = False
     def check(name: str, value: Any) -> float:
         if not is_number(value):
             expected = "a number"
-        elif not (math.isfinite(value) and least <= value) or (above and value == least):
+        elif not math.isfinite(value):
+            expected = "finite"
+        elif value < least or (above and value == least):
             expected = f"{'above' if above else 'at least'} {least:g}"
-            expected = "finite" if least == -math.inf else expected
         elif value > most:
             expected = f"at most {most:g}"
         else:
@@ -73,21 +75,34 @@ def one_of(*words: str) -> Check:
     return check
 
 
+def _or(check: Check, accepts: Callable[[Any], bool], also: str) -> Check:
+    """Accept further values, which messages mention."""
+
+    def extended(name: str, value: Any) -> Any:
+        if accepts(value):
+            return value
+        try:
+            return check(name, value)
+        except ValueError as error:
+            message = str(error).replace(" must be ", f" must be {also} or ", 1)
+            raise ValueError(message) from None
+
+    return extended
+
+
 def optional(check: Check) -> Check:
     """Accept None, too."""
-    return lambda name, value: None if value is None else check(name, value)
+    return _or(check, lambda value: value is None, "None")
 
 
 def either(choice: str, check: Check) -> Check:
     """Accept one word, too."""
-    return lambda name, value: (
-        choice if isinstance(value, str) and value == choice else check(name, value)
-    )
+    return _or(check, lambda value: isinstance(value, str) and value == choice, f'"{choice}"')
 
 
 def or_schedule(check: Check) -> Check:
     """Accept a function of the progress that remains, too."""
-    return lambda name, value: value if callable(value) else check(name, value)
+    return _or(check, callable, "a function")
 
 
 def or_infinity(check: Check) -> Check:

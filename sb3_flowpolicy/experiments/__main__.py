@@ -8,6 +8,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from sb3_flowpolicy.common.command_line import HelpFormatter
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
@@ -120,13 +121,6 @@ def _report(args: argparse.Namespace) -> None:
         print(f"Tables, figures and data: {write_docs(args.results, args.docs)}")
 
 
-class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Shows defaults, except None, which the help texts explain themselves."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        return action.help if action.default is None else super()._get_help_string(action)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.experiments",
@@ -144,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
             name,
             help=text,
             description=text[0].upper() + text[1:] + ".",
-            formatter_class=_HelpFormatter,
+            formatter_class=HelpFormatter,
         )
         command.set_defaults(command=function)
         add = command.add_argument

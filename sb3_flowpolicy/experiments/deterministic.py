@@ -11,6 +11,7 @@ from typing import Any
 import torch as th
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.command_line import HelpFormatter
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.experiments.measures import DeterministicEpisodes, own_random_numbers
@@ -71,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m sb3_flowpolicy.experiments.deterministic",
         description="Train sac_flow and test it in four ways: the base mean, the best of 64 "
         "candidates by density, the best by the critics, and with exploration.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("--envs", nargs="+", default=["TunnelHorizontal-v0", "TunnelDiagonal-v0"])
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(101, 111)))

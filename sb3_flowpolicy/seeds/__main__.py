@@ -15,12 +15,16 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.common.command_line import HelpFormatter, at_least, run
 from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
 # Checkpoints of a run, besides those after each evaluation and at the end.
 CHECKPOINTS = 10
+_RESUME_HELP = (
+    "continue the run in the folder, up to n-timesteps, with its own seeds and hyperparameters"
+)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -140,18 +144,23 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m sb3_flowpolicy.seeds",
         description="Train several seeds of an agent at once, for little more than the cost of "
         "one, with the hyperparameters that rl_zoo3 would use.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     add = parser.add_argument
     add("--algo", default="sac_flow", help="sac_flow, sac_lowrank or sac_gauss")
     add("--env", default="TunnelDiagonal-v0", help="environment id", type=_known_env)
-    add("--seeds", type=int, default=10, help="number of seeds")
-    add("--first-seed", type=int, default=0, help="the seeds are this one and those after it")
-    add("-n", "--n-timesteps", type=int, help="steps per seed (default: the file's)")
+    add("--seeds", type=at_least(1), default=10, help="number of seeds")
+    add(
+        "--first-seed",
+        type=at_least(0),
+        default=0,
+        help="first of consecutive seeds",
+    )
+    add("-n", "--n-timesteps", type=at_least(1), help="steps per seed (default: the file's)")
     add("-params", "--hyperparams", nargs="+", default=[], help="overrides, as key:value")
     add("-f", "--log-folder", default="logs", help="where to save agents and monitor files")
     add("-tb", "--tensorboard-log", help="TensorBoard folder, one run per seed")
-    add("--eval-episodes", type=int, default=20, help="test episodes per seed at the end")
+    add("--eval-episodes", type=at_least(1), default=20, help="test episodes per seed at the end")
     add("--eval-freq", type=int, help="steps between tests, written to evaluations.csv")
     add(
         "--num-threads",
@@ -160,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
         help="torch threads; one is fastest for small networks",
     )
     add("-P", "--progress", action="store_true", help="show a progress bar")
-    add("--resume", action="store_true", help="continue the run in the folder, up to n-timesteps")
+    add("--resume", action="store_true", help=_RESUME_HELP)
     return parser
 
 
@@ -173,4 +182,4 @@ def _known_env(env_id: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -15,6 +15,7 @@ from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.segments import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
+from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.engine import LOSSES, EngineRuntime, settings_key
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.episodes import SeedEpisodes
@@ -179,9 +180,11 @@ class SeedBatch:
             Itself.
 
         Raises:
+            ValueError: If ``total_timesteps`` is not a number of at least 0.
             NonFiniteError: If an environment returns, or training produces, NaN or infinity; see
                 :class:`~sb3_flowpolicy.guard.training_guard.TrainingGuard`.
         """
+        number(0)("total_timesteps", total_timesteps)
         with (
             self._checkpoints.learning(checkpoint_path, checkpoint_every),
             self._runtime.running(watched=callback is not None),

@@ -33,7 +33,7 @@ def check_seeds(seeds: int | Iterable[int]) -> list[int]:
     many = seeds if isinstance(seeds, Iterable) else range(operator.index(seeds))
     listed = [operator.index(seed) for seed in many]
     if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
-        raise ValueError(f"seeds must be different, at least 0 and at least one, got {seeds!r}")
+        raise ValueError(f"seeds must be one or more different integers from 0 on, got {seeds!r}")
     return listed
 
 

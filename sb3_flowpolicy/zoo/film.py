@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from sb3_flowpolicy.common.command_line import run
 from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
 from sb3_flowpolicy.zoo.saved_run import load_run, run_parser
 
@@ -40,4 +41,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -6,6 +6,7 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_flowpolicy.common.command_line import HelpFormatter
 from sb3_flowpolicy.zoo.registration import ALGORITHMS, register
 
 
@@ -14,7 +15,7 @@ def run_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m sb3_flowpolicy.zoo.{command}",
         description=description,
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     add = parser.add_argument
     add("--algo", default="sac_flow", choices=ALGORITHMS, help="algorithm")

@@ -84,7 +84,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "schedule": (setting("settings.learning_rate", {"schedule": "code"}), "learning_rate must be"),
     "rate": (setting("settings.learning_rate", -1.0), "learning_rate must be at least 0, got -1"),
     "setting": (setting("settings.gamma", "high"), "gamma must be a number, got 'high'"),
-    "seed": (setting("settings.seed", 2**40), "seed must be an integer"),
+    "seed": (setting("settings.seed", 2**40), "seed must be None or an integer"),
     "undecided": (setting("settings.target_entropy", "auto"), "target_entropy must be a number"),
     "progress": (setting("progress.num_timesteps", -1), "num_timesteps must be an integer"),
     "buffer": (setting("replay_buffer.class", "dict"), "replay_buffer_class must be one of"),

@@ -116,7 +116,9 @@ def test_altered_and_missing_files_are_noticed(name: str, run: Path) -> None:
 def test_folders_without_a_good_checkpoint(run: Path, tmp_path: Path) -> None:
     assert has_checkpoint(run)
     assert not has_checkpoint(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match=r"a folder of checkpoints, got .* which has none"):
+    with pytest.raises(
+        ValueError, match=r"a folder of checkpoints, got .* which has no checkpoint"
+    ):
         SACFlow.resume(tmp_path / "nowhere", ENV)
     for path in run.rglob("model.zip"):
         path.unlink()

@@ -135,8 +135,8 @@ def test_any_two_coordinates_meet_in_different_halves(features: int) -> None:
     ("kwargs", "message"),
     [
         ({"layers": 0}, "layers must be an integer of at least 1, got 0"),
-        ({"hidden": ()}, "hidden must be a list of layer sizes, at least 1"),
-        ({"hidden": 10}, "hidden must be a list of layer sizes, at least 1, got 10"),
+        ({"hidden": ()}, "hidden must be a list of one or more layer sizes"),
+        ({"hidden": 10}, "hidden must be a list of one or more layer sizes, got 10"),
         ({"hidden": (10, 0)}, "hidden must be an integer of at least 1, got 0"),
         ({"init": "zeros"}, "init must be one of .*'identity', 'default'.*, got 'zeros'"),
     ],

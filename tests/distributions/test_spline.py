@@ -159,7 +159,7 @@ def test_far_away_points_score_as_a_normal_would() -> None:
         ({"bins": 1}, "bins must be an integer of at least 2, got 1"),
         ({"bins": 4.0}, "bins must be an integer of at least 2, got 4.0"),
         ({"layers": 0}, "layers must be an integer of at least 1, got 0"),
-        ({"hidden": ()}, "hidden must be a list of layer sizes, at least 1"),
+        ({"hidden": ()}, "hidden must be a list of one or more layer sizes"),
         ({"init": "zeros"}, "init must be one of .*'identity', 'default'.*, got 'zeros'"),
     ],
 )

@@ -130,10 +130,13 @@ def test_sb3_distribution_interface(actor: FlowActor) -> None:
             {"distribution": "low_rank", "distribution_kwargs": {"rank": 3}},
             "rank must be an integer from 1 to 2, got 3",
         ),
-        ({"distribution_kwargs": {2: "layers"}}, "distribution_kwargs must be a dict with strings"),
+        (
+            {"distribution_kwargs": {2: "layers"}},
+            "distribution_kwargs must be None or a dict with strings",
+        ),
         (
             {"distribution_kwargs": "layers=4"},
-            "distribution_kwargs must be a dict .* got 'layers=4'",
+            "distribution_kwargs must be None or a dict .* got 'layers=4'",
         ),
         ({"distribution": ["realnvp"]}, "distribution must be one of"),
         ({"use_sde": True}, "use_sde must be False unless distribution is 'gaussian'"),

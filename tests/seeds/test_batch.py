@@ -265,9 +265,9 @@ def test_learns_what_a_single_agent_learns() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"seeds": 0}, "seeds must be different, at least 0 and at least one, got 0"),
+        ({"seeds": 0}, "seeds must be one or more different integers from 0 on, got 0"),
         ({"seeds": [1, 1]}, r"seeds must be different.*got \[1, 1\]"),
-        ({"seeds": [-3]}, r"at least 0 and at least one, got \[-3\]"),
+        ({"seeds": [-3]}, r"different integers from 0 on, got \[-3\]"),
         ({"train_freq": (1, "episode")}, "train_freq must count steps"),
         ({"gradient_steps": -1}, "gradient_steps be at least 0"),
         ({"n_steps": 3}, "replay buffers must be plain ReplayBuffers, got NStepReplayBuffer"),

@@ -1,0 +1,50 @@
+"""What the package's commands have in common."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from sb3_flowpolicy.common.validation import integer
+
+
+class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows defaults, except None, which the help texts explain themselves."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default is None else super()._get_help_string(action)
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return a type for argparse: integers of at least ``least``.
+
+    Example:
+        >>> at_least(1)("3")
+        3
+        >>> at_least(1)("0")
+        Traceback (most recent call last):
+        ...
+        argparse.ArgumentTypeError: value must be an integer of at least 1, got 0
+    """
+
+    def convert(text: str) -> int:
+        try:
+            value: Any = int(text)
+        except ValueError:
+            value = text
+        try:
+            return integer(least)("value", value)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return convert
+
+
+def run(main: Callable[[], Any]) -> None:
+    """Run a command; say in one line what went wrong, without a traceback."""
+    try:
+        main()
+    except (ValueError, AssertionError, OSError) as error:  # rl_zoo3 asserts
+        sys.exit(f"error: {error}")
