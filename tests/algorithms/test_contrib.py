@@ -94,7 +94,7 @@ def test_on_policy_algorithms_have_no_colored_noise() -> None:
         ({"action_noise_color": 2.0}, "action_noise_color must be"),
         ({"policy": "stock", "action_noise_color": 1.0}, "one of sb3_flowpolicy's"),
         ({"ent_coef": -1.0}, "ent_coef must be at least 0, got -1.0"),
-        ({"learning_rate": -1.0}, "learning_rate must be at least 0, got -1.0"),
+        ({"learning_rate": -1.0}, "learning_rate must be a function or at least 0, got -1.0"),
         ({"policy": FlowPolicy}, "policy must be one of .* got FlowPolicy"),
         ({"policy": FlowActorCriticPolicy}, "policy must be one of .* got FlowActorCriticPolicy"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics must be an integer of at least 1, got 0"),

@@ -132,7 +132,7 @@ def test_loaded_model_needs_no_demonstrations(tmp_path: Path) -> None:
     [
         ({"random_steps": -1}, "random_steps must be None or at least 0, got -1"),
         ({"critic_loss_coef": 0.0}, "critic_loss_coef must be above 0, got 0.0"),
-        ({"critic_loss_coef": float("nan")}, "critic_loss_coef must be above 0, got nan"),
+        ({"critic_loss_coef": float("nan")}, "critic_loss_coef must be finite, got nan"),
         ({"demonstrations": "nowhere.npz"}, "got 'nowhere.npz' .*No such file"),
         ({"demonstrations": {"actions": np.zeros(3)}}, r"demonstrations must have the arrays"),
         ({"policy": "NoPolicy"}, "policy must be one of .* got 'NoPolicy'"),

@@ -249,7 +249,7 @@ def test_every_argument_of_the_constructor_is_held_or_left_out_on_purpose() -> N
         ({"replay_buffer_kwargs": {"env": {1}}}, "replay_buffer_kwargs must be made of"),
         ({"policy_kwargs": {"use_sde": True}}, "use_sde must be False for a safe bundle"),
         ({"policy_class": SACFlow}, "policy_class must be one of"),
-        ({"gamma": float("nan")}, "gamma must be at least 0, got nan"),
+        ({"gamma": float("nan")}, "gamma must be finite, got nan"),
     ],
 )
 def test_what_needs_code_is_refused_when_saving(
