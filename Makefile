@@ -28,7 +28,7 @@ train: $(VENV)/.installed  ## Train ALGO on ENV with SEED, print the success rat
 	$(BIN)/python -m sb3_flowpolicy.zoo.evaluate --algo $(ALGO) --env $(ENV) --folder $(LOGS)
 
 test: $(VENV)/.installed  ## Run the tests
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --durations 15
 
 $(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
 	test -x $(LOWEST)/bin/python || $(PYTHON) -m venv $(LOWEST)

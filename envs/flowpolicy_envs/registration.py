@@ -58,8 +58,8 @@ independent noise causes and joint motion does not; see docs/environments/square
 _MOVE_V1: dict[str, Any] = {**_MOVE, **_V1, "weight": 7.5, "linear_damping": 1.0}
 """Again 6 N are required."""
 
-_HOLD_V1: dict[str, Any] = {**_V1, "weight": 11.25, "max_force": 3.0}
-"""9 N are required: all that three fingers can exert."""
+_HOLD_V1: dict[str, Any] = {**_V1, "weight": 11.5, "max_force": 3.0}
+"""9.2 N are required; three fingers can exert 9 N."""
 
 SQUARE_IDS: dict[str, dict[str, Any]] = {
     "Square-v0": {},

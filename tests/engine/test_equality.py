@@ -117,8 +117,10 @@ def check_equal_to_sb3(
     """For "MlpPolicy" the peer is untouched SB3, for the others SB3's loop with our policy."""
     ours_policy = "GaussPolicy" if policy == "MlpPolicy" else policy
     policy_kwargs: dict[str, Any] = {"optimizer_kwargs": {"weight_decay": weight_decay}}
-    if compile and policy in ("FlowPolicy", "spline"):
-        policy_kwargs["distribution_kwargs"] = {"layers": 2}  # compiling each one takes long
+    if compile:  # each layer takes long to compile
+        policy_kwargs["net_arch"] = [16]
+        if policy in ("FlowPolicy", "spline"):
+            policy_kwargs["distribution_kwargs"] = {"layers": 2, "hidden": [10]}
     settings = {"ent_coef": ent_coef, "policy_kwargs": policy_kwargs}
     stock = make(SAC, policy, dtype, **settings)
     ours = make(SACFlow, ours_policy, dtype, compile=compile, **settings)
@@ -206,7 +208,8 @@ def test_updating_seeds_in_groups_changes_nothing(
     n_seeds, engines = 4, []
     for bytes_at_once in (10**9, 2 * 2 * 16 * BATCH_SIZE * 4):
         monkeypatch.setattr(groups, "BYTES_AT_ONCE", bytes_at_once)
-        models = [make(SACFlow, policy, th.float32, s, ent_coef=ent_coef) for s in range(n_seeds)]
+        kwargs = {"ent_coef": ent_coef, "policy_kwargs": {"net_arch": [16]}}
+        models = [make(SACFlow, policy, th.float32, seed, **kwargs) for seed in range(n_seeds)]
         engine = Engine(models, compiled=compiled)
         seed_everything()
         losses = [engine.train(engine.draw(5, BATCH_SIZE)) for _ in range(2)]

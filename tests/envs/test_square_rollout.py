@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from flowpolicy_envs.registration import SQUARE_IDS
 from flowpolicy_envs.square.batch import SquareBatch
 from flowpolicy_envs.square.config import DIRECTIONS, SquareConfig
 from flowpolicy_envs.square.tasks import FindGoal, MoveX
@@ -93,3 +94,18 @@ def test_targets_move_linearly_during_the_slew():
     # A substep halves the distance to the target, which has moved by 0.02 before.
     assert np.abs(jumped - start).sum() == pytest.approx(4 * 0.2, rel=0.01)
     assert np.abs(slewed - start).sum() == pytest.approx(4 * (0.2 - 0.02), rel=0.01)
+
+
+@pytest.mark.parametrize("env_id", ["SquareHold-v1", "SquareMoveX-v1"])
+@pytest.mark.parametrize("idle", range(4))
+def test_three_fingers_do_not_carry_the_square(env_id, idle):
+    arguments = {k: v for k, v in SQUARE_IDS[env_id].items() if k not in ("task", "warm_up")}
+    world = grip(0.9 * INWARDS, steps=8, **arguments)
+    assert world.held.item() is True
+    three = 0.9 * INWARDS.reshape(4, 2)
+    three[idle] *= -1.0
+    held = []
+    for _ in range(12):
+        world.step([three.ravel()])
+        held.append(world.held.item())
+    assert not any(held[2:])

@@ -158,7 +158,7 @@ class SquareEnv(BatchEnv):
 
     * v1 (all ids but `Square`): `friction_cone`, `slew` of 0.25 s, stiffer fingers (`kp` 50, `kd`
       0.5) and `friction` 1.25, so that independent noise breaks the grip and joint motion does
-      not; moving: `weight` 7.5, `linear_damping` 1; holding: `weight` 11.25, `max_force` 3
+      not; moving: `weight` 7.5, `linear_damping` 1; holding: `weight` 11.5, `max_force` 3
     * v0: Initial version
     """
 
