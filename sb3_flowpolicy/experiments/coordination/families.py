@@ -48,8 +48,8 @@ along x, and along y; the two ways to turn the square."""
 _GROUPS = np.abs([*INWARDS, MODES["joint x"][1], MODES["joint y"][1]]) > 0.0
 
 
-_JOINT = 0.15
-"""Scale of the two joint motions where the search of a low rank begins."""
+_JOINT = 0.1
+"""Scale of the joint motions where the search of a low rank begins."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,19 @@ def independent(parameters: Array) -> Array:
 
 
 def rank_2(parameters: Array) -> Array:
-    """Return the root (8, 10) of diag + V V^T.
+    """Return the root (8, 10) of diag + V V^T, where V moves all fingers along x and along y.
 
     Args:
-        parameters: Those of `independent`, and V (8, 2), flattened, (20,).
+        parameters: Those of `independent`, and for either column of V how far the fingers move
+            that press along the axis, and the others, (8,).
     """
-    return np.hstack([independent(parameters[:4]), parameters[4:].reshape(8, 2)])
+    columns = [
+        first * MODES[name][0] + second * MODES[name][1]
+        for name, (first, second) in zip(
+            ("joint x", "joint y"), parameters[4:].reshape(2, 2), strict=True
+        )
+    ]
+    return np.column_stack([independent(parameters[:4]), *columns])
 
 
 def full(parameters: Array) -> Array:
@@ -113,8 +120,7 @@ def full(parameters: Array) -> Array:
 
 
 def _start_rank_2(parameters: Array) -> Array:
-    joint = [np.add(*MODES[name]) for name in ("joint x", "joint y")]
-    return np.concatenate([parameters - 0.1, _JOINT * np.column_stack(joint).ravel()])
+    return np.concatenate([parameters, np.full(4, _JOINT)])
 
 
 def _start_full(parameters: Array) -> Array:
