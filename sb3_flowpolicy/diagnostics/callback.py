@@ -66,7 +66,8 @@ class PolicyDiagnosticsCallback(BaseCallback):
 
     Args:
         log_freq: Environment steps between two measurements, at least 1.
-        image_freq: Environment steps between two sets of pictures; 0 draws none.
+        image_freq: Environment steps between two sets of pictures, which are measured, too; 0 draws
+            none.
         n_states: Number of states, at least 1.
         n_samples: Number of actions per state, at least 2.
 
@@ -108,10 +109,10 @@ class PolicyDiagnosticsCallback(BaseCallback):
         buffer = self.model.replay_buffer
         if self.num_timesteps <= self.model.learning_starts or buffer is None:
             return True
-        if self._due(self.log_freq):
+        draw = self.image_freq > 0 and self._due(self.image_freq)
+        if draw or self._due(self.log_freq):
             with self._own_random_numbers(), th.no_grad():
                 data = buffer.sample(self.n_states, env=self.model.get_vec_normalize_env())
-                draw = self.image_freq > 0 and self._due(self.image_freq)
                 self._measure(data.observations, data.actions, draw)
         return True
 
