@@ -226,7 +226,8 @@ class SACFlow(OffPolicyFlow, SAC):
         While the model learns with a compiled policy, callbacks such as ``EvalCallback`` act with
         it, too, if they evaluate as many environments at once as the model learns from.
         """
-        if self._runtime.is_running and isinstance(observation, np.ndarray):
+        is_base = not deterministic or getattr(self.policy, "deterministic_mode", "base") == "base"
+        if is_base and self._runtime.is_running and isinstance(observation, np.ndarray):
             engine = self._runtime.engine()
             if engine is not None and engine.compiled:
                 obs, is_batch = self.policy.obs_to_tensor(observation)
@@ -244,8 +245,7 @@ class SACFlow(OffPolicyFlow, SAC):
     ) -> np.ndarray | None:
         """Return scaled actions, None if there is no compiled function for them."""
         obs = obs.unsqueeze(0).contiguous()
-        base = getattr(self.policy, "deterministic_mode", "base") == "base"
-        if not engine.has_compiled_policy(obs) or (deterministic and not base):
+        if not engine.has_compiled_policy(obs):
             return None
         noise = None
         if deterministic:  # the mode is the image of no noise

@@ -12,6 +12,7 @@ import torch as th
 
 from sb3_flowpolicy.benchmarks.report import SCHEMA, Row, rows, table
 from sb3_flowpolicy.benchmarks.timing import measure
+from sb3_flowpolicy.common.command_line import check_folder_of
 from sb3_flowpolicy.common.files import write_json
 from sb3_flowpolicy.common.machine import machine
 
@@ -64,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     quick = "a trial of less than a minute, with few rows and short turns: do not quote its rates"
     add("--quick", action="store_true", help=quick)
     args = parser.parse_args(arguments)
-    if args.json is not None and not args.json.absolute().parent.is_dir():
-        parser.error(f"--json must name a file in an existing directory, got {args.json}")
+    check_folder_of(parser, "--json", args.json)
     if args.threads is not None:
         th.set_num_threads(args.threads)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from sb3_flowpolicy.common.validation import integer
@@ -40,6 +41,12 @@ def at_least(least: int) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(str(error)) from None
 
     return convert
+
+
+def check_folder_of(parser: argparse.ArgumentParser, option: str, path: Path | None) -> None:
+    """End with an error, before any work, if the file of an option cannot be written."""
+    if path is not None and not path.absolute().parent.is_dir():
+        parser.error(f"{option} must name a file in an existing directory, got {path}")
 
 
 def run(main: Callable[[], Any]) -> None:

@@ -181,9 +181,9 @@ class SquareBatch:
         flags = np.zeros((2, *shape), np.bool_)
         numbers = np.zeros((2, *shape))
         mean = np.asarray(means, np.float64)
-        kernels.roll_out(
-            mean, noise, self.everyone.copy(), *flags, *numbers, *self._rules, *self._seen
-        )
+        ends = (self.rewards, self.terminated)
+        rest = (*self._rules, *self._seen)
+        kernels.roll_out(mean, noise, self.everyone.copy(), *flags, *numbers, *ends, rest)
         return RollOut(*flags, *numbers)
 
     def info(self, n: int) -> dict[str, Any]:

@@ -135,7 +135,7 @@ class SquareEnv(BatchEnv):
     | `dt` | 0.01 | positive | s per substep |
     | `substeps` | 25 | at least 1 | per step of the agent |
     | `slew` | 0 | at least 0, at most a step | s in which targets move to the requested ones |
-    | `friction_cone` | `False` | | friction that drags the square does not carry it, see below |
+    | `friction_cone` | `False` | | friction that drags the square does not carry it, see above |
     | `render_mode` | `None` | `None`, `"rgb_array"`, `"human"` | effect of `render()` |
     | `render_size` | 600 | at least 16 | edge of a frame, pixels |
 

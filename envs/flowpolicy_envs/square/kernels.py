@@ -587,41 +587,16 @@ def roll_out(
     failed: np.ndarray,
     gathered: FloatArray,
     log_slopes: FloatArray,
-    dt: float,
-    substeps: int,
-    slew: int,
-    cone: bool,
-    warm_steps: float,
-    reward_terms: FloatArray,
-    goals: FloatArray,
-    path: FloatArray,
-    scratch: FloatArray,
-    forces: FloatArray,
     rewards: FloatArray,
     terminated: np.ndarray,
-    picked: np.ndarray,
-    observation_noise: FloatArray,
-    features: FloatArray,
-    constants: FloatArray,
-    starts: FloatArray,
-    bodies: FloatArray,
-    fingers: FloatArray,
-    targets: FloatArray,
-    actions: FloatArray,
-    presses: FloatArray,
-    tallies: FloatArray,
-    metrics: FloatArray,
-    held: np.ndarray,
-    found: np.ndarray,
-    success: np.ndarray,
-    ends: np.ndarray,
-    observations: np.ndarray,
+    step_arguments: tuple,
 ) -> None:
     """Step the `active` (N,) worlds until they end, with the actions tanh(u), in place.
 
     In step t, u is the sum of `means` (8,) and `noise` (T, N, 8). Overwritten, each (T, N), are
     `taken` by whether the world was still active, `failed` by whether it ended, `gathered` by the
     rewards, and `log_slopes` by the sum over the components of log(1 - tanh(u)^2).
+    `step_arguments` are those of `step_batch` from `dt` on, `rewards` and `terminated` among them.
     """
     steps, count = noise.shape[0], noise.shape[1]
     requests = np.zeros((count, ACTIONS))
@@ -636,39 +611,7 @@ def roll_out(
                 size = abs(u)
                 log_slope += 2.0 * (_LOG_2 - size - math.log1p(math.exp(-2.0 * size)))
             log_slopes[t, n] = log_slope
-        step_batch(
-            requests,
-            active,
-            dt,
-            substeps,
-            slew,
-            cone,
-            warm_steps,
-            reward_terms,
-            goals,
-            path,
-            scratch,
-            forces,
-            rewards,
-            terminated,
-            picked,
-            observation_noise,
-            features,
-            constants,
-            starts,
-            bodies,
-            fingers,
-            targets,
-            actions,
-            presses,
-            tallies,
-            metrics,
-            held,
-            found,
-            success,
-            ends,
-            observations,
-        )
+        step_batch(requests, active, *step_arguments)
         for n in range(count):
             gathered[t, n], failed[t, n] = rewards[n], terminated[n]
             if terminated[n]:

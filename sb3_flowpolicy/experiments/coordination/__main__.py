@@ -9,6 +9,8 @@ from typing import Any
 
 import yaml
 
+from sb3_flowpolicy.common.command_line import check_folder_of
+
 _DESCRIPTION = """\
 Predict, without training, how much an agent gains from noise that correlates between fingers.
 
@@ -73,8 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--modes", action="store_true", help="also print the noise of each joint motion")
     add("--json", type=Path, metavar="FILE", help="also write the results to this file")
     args = parser.parse_args(arguments)
-    if args.json is not None and not args.json.absolute().parent.is_dir():
-        parser.error(f"--json must name a file in an existing directory, got {args.json}")
+    check_folder_of(parser, "--json", args.json)
     # Slow imports that --help does not need.
     try:
         from tqdm import tqdm
