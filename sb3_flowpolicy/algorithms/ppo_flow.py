@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+import math
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.utils import explained_variance
 
 from sb3_flowpolicy.common.validation import (
     Check,
     by_name,
     check_policy,
     check_settings,
+    either,
     flag,
     integer,
     number,
@@ -20,6 +23,9 @@ from sb3_flowpolicy.common.validation import (
     or_infinity,
     or_schedule,
 )
+from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
+from sb3_flowpolicy.engine.ppo_engine import PPOEngine, why_ppo_unsupported
+from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy
 
@@ -38,19 +44,25 @@ _SETTINGS: dict[str, Check] = {
     "target_kl": optional(number(0, above=True)),
     "stats_window_size": integer(1),
     "seed": optional(integer(0, 2**32 - 1)),
+    "compile": either("auto", flag),
 }
 
 
 class PPOFlow(PPO):
     """Proximal Policy Optimization with action distributions that correlate and bend.
 
-    SB3's :class:`~stable_baselines3.PPO` with additional policy aliases.
+    SB3's :class:`~stable_baselines3.PPO` with additional policy aliases and compiled updates.
 
     Args:
         policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``, their
             ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of PPO, in its order.
+        compile: Whether to compile updates and the policy that collects experience: several times
+            faster after about 15 seconds of warm-up. ``"auto"`` compiles once calls of
+            :meth:`learn` have planned enough updates to repay it. Compiled or not, the numbers are
+            the same up to rounding. Policies and buffers that cannot be compiled (with dropout,
+            frozen parameters, dictionary observations, ...) run SB3's own loop.
         **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that
             successive actions are independent.
 
@@ -66,11 +78,54 @@ class PPOFlow(PPO):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = on_policy.ALIASES
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, compile: bool | Literal["auto"] = "auto", **kwargs: Any) -> None:
         given = by_name(PPO, args, kwargs)
-        check_settings(given, _SETTINGS)
+        check_settings({**given, "compile": compile}, _SETTINGS)
         check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
+        self.compile: bool | Literal["auto"] = compile
+        self._planned_updates = 0
+        self._engine: PPOEngine | None = None
         super().__init__(*args, **kwargs)
+
+    def learn(self, *args: Any, **kwargs: Any) -> Any:
+        """Learn as SB3's PPO does, compiled where that pays."""
+        size = sum(parameter.numel() for parameter in self.policy.parameters())
+        try:
+            with threads_for(size * self.batch_size), flushed_subnormals():
+                return super().learn(*args, **kwargs)
+        finally:
+            if self._engine is not None:
+                self._engine.release()
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+        rollout = self.n_steps * self.n_envs
+        rollouts = math.ceil((total_timesteps - self.num_timesteps) / rollout)
+        self._planned_updates += rollouts * self.n_epochs * math.ceil(rollout / self.batch_size)
+        return total_timesteps, callback
+
+    def _bound_engine(self) -> PPOEngine | None:
+        """Return the engine, bound to the policy as it is now; None for SB3's own loop."""
+        enough = self._planned_updates >= UPDATES_WORTH_COMPILING
+        wanted = enough if self.compile == "auto" else self.compile
+        wanted = wanted and why_ppo_unsupported(self) is None
+        if self._engine is not None and not (wanted and self._engine.fits()):
+            self._engine.release()
+            self._engine = None
+        if not wanted:
+            return None
+        if self._engine is None:
+            self._engine = PPOEngine(self)
+        self._engine.synchronize()
+        return self._engine
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
+        """Collect experience as SB3 does."""
+        engine = self._bound_engine()
+        if engine is None:
+            return super().collect_rollouts(*args, **kwargs)
+        with engine.collecting():
+            return super().collect_rollouts(*args, **kwargs)
 
     def train(self) -> None:
         """Do PPO's updates.
@@ -90,4 +145,35 @@ class PPOFlow(PPO):
                     value,
                     self.num_timesteps,
                 )
-        super().train()
+        # Otherwise a tenth of the time would go into an entropy that is multiplied by 0.
+        if isinstance(self.policy, on_policy.DensityActorCritic):
+            self.policy.action_dist.estimates_entropy = self.ent_coef != 0.0
+        engine = self._bound_engine()
+        if engine is None:
+            super().train()
+        else:
+            self._train_with(engine)
+
+    def _train_with(self, engine: PPOEngine) -> None:
+        """Do and record what SB3's ``train`` does and records."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        clip_range_vf = math.inf
+        if self.clip_range_vf is not None:
+            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+        losses = engine.train(clip_range, clip_range_vf)
+        last = losses.pop("loss")[-1]
+        for name, values in losses.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+        self.logger.record("train/loss", last)
+        buffer = self.rollout_buffer
+        variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        self.logger.record("train/explained_variance", variance)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/clip_range", clip_range)
+        if self.clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_engine"]

@@ -25,7 +25,7 @@ from sb3_flowpolicy.engine.update import (
 from sb3_flowpolicy.policies import FlowActor
 
 # Layers that behave differently in training, or draw random numbers of their own.
-_MODE_DEPENDENT = (
+MODE_DEPENDENT = (
     nn.modules.batchnorm._BatchNorm,
     nn.modules.dropout._DropoutNd,
     nn.RReLU,
@@ -44,7 +44,7 @@ def why_unsupported(model: SAC) -> str | None:
     if any(True for _ in policy.critic_target.features_extractor.parameters()):
         return "features extractor with parameters"
     for module in policy.modules():
-        if isinstance(module, _MODE_DEPENDENT):
+        if isinstance(module, MODE_DEPENDENT):
             return f"layer of type {type(module).__name__}"
     for network in policy.critic.q_networks:
         for layer in network.children():

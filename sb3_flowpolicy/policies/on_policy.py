@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_flowpolicy.common.validation import flag, number
@@ -23,7 +23,11 @@ from sb3_flowpolicy.policies.base import (
     check_net_arch,
     with_forms,
 )
-from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
+from sb3_flowpolicy.policies.sb3_distribution import (
+    ENTROPY_PAIRS,
+    ActionDistributionAdapter,
+    estimate_entropy,
+)
 
 # Arguments of SB3's gSDE, which is not built.
 _UNUSED = {"use_sde", "full_std", "use_expln", "squash_output"}
@@ -67,6 +71,8 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5, which
         proposes these densities for on-policy algorithms.
     """
+
+    action_dist: ActionDistributionAdapter
 
     def __init__(
         self,
@@ -116,6 +122,8 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         density = TanhSquashed(density) if self._squashes else density
         self.action_net: nn.Module = density.to(self.device)
         self.action_dist = ActionDistributionAdapter(density)
+        with th.no_grad():
+            self._has_exact_entropy = density.entropy(th.zeros(1, features)) is not None
         parameters, rate = self.parameters(), lr_schedule(1)
         self.optimizer = self.optimizer_class(parameters, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
@@ -136,8 +144,56 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         found = super().evaluate_actions(*args, **kwargs)
         check_finite(found[1].detach().cpu().numpy(), "log-probabilities")
         if found[1].requires_grad:
-            found[1].register_hook(_bounded)
+            found[1].register_hook(bound_gradient)
         return found
+
+    def score(
+        self, obs: PyTorchObs, actions: th.Tensor, noise: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Do the computation of :meth:`evaluate_actions`, given noise.
+
+        Args:
+            obs: Observations of a batch B.
+            actions: Actions, (B, D).
+            noise: Standard normals (K, B, M), to estimate an entropy without closed form.
+
+        Returns:
+            Values (B, 1), log-probabilities (B,), and entropies (B,) or None.
+        """
+        latent, values = self._latent_and_values(obs)
+        density = self.action_dist.density
+        entropy = density.entropy(latent)
+        if entropy is None and noise is not None:
+            entropy = estimate_entropy(density, latent, noise)
+        return values, density.log_prob(latent, actions), entropy
+
+    def sample_and_score(
+        self, obs: PyTorchObs, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Do the computation of :meth:`forward`, given noise (B, M)."""
+        latent, values = self._latent_and_values(obs)
+        density = self.action_dist.density
+        actions = density.rsample_and_log_prob(latent, noise)[0]
+        log_prob = density.log_prob(latent, actions)
+        return actions.reshape(-1, *(self.action_space.shape or ())), values, log_prob
+
+    def draw_noise(self, *shape: int) -> th.Tensor:
+        """Draw standard normals, (*shape, M)."""
+        shape = (*shape, self.action_dist.density.noise_dim)
+        return th.randn(shape, dtype=self.value_net.weight.dtype, device=self.device)
+
+    def draw_entropy_noise(self, batch_size: int) -> th.Tensor | None:
+        """Draw the noise for :meth:`score`, (K, B, M); None if the entropy has a closed form."""
+        return None if self._has_exact_entropy else self.draw_noise(ENTROPY_PAIRS, batch_size)
+
+    def _latent_and_values(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        features = self.extract_features(obs)
+        if self.share_features_extractor:
+            latent, latent_vf = self.mlp_extractor(features)
+        else:
+            latent = self.mlp_extractor.forward_actor(features[0])
+            latent_vf = self.mlp_extractor.forward_critic(features[1])
+        return latent, self.value_net(latent_vf)
 
     def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
         return self.action_dist.proba_distribution(latent_pi)
@@ -152,7 +208,7 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         }
 
 
-def _bounded(gradient: th.Tensor) -> th.Tensor:
+def bound_gradient(gradient: th.Tensor) -> th.Tensor:
     """Bound a gradient. NaN, which is 0 times infinity for a ratio that PPO clipped, becomes 0."""
     return gradient.nan_to_num(nan=0.0).clamp(-_LARGEST_GRADIENT, _LARGEST_GRADIENT)
 

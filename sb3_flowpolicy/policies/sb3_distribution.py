@@ -27,6 +27,9 @@ class ActionDistributionAdapter(Distribution):
         torch.Size([4, 2])
     """
 
+    #: Whether an entropy without closed form is estimated.
+    estimates_entropy = True
+
     def __init__(self, density: ActionDistribution) -> None:
         super().__init__()
         self.density = density
@@ -45,21 +48,17 @@ class ActionDistributionAdapter(Distribution):
         """Score ``actions`` (batch, D): shape (batch,)."""
         return self.density.log_prob(self.context, actions)
 
-    def entropy(self) -> th.Tensor:
+    def entropy(self) -> th.Tensor | None:
         """Return the entropy, or an estimate with gradient: shape (batch,).
 
-        Squashed densities and flows have no closed form. Their entropy is that of the noise, which
-        is known, plus the expected log-determinant, which is estimated. Noise is drawn in pairs of
-        opposite sign, which cancels the terms of the error that are odd in it.
+        Squashed densities and flows have no closed form: see :func:`estimate_entropy`, or None if
+        :attr:`estimates_entropy` is False. SB3 then logs the mean of -log p instead.
         """
         exact = self.density.entropy(self.context)
-        if exact is not None:
+        if exact is not None or not self.estimates_entropy:
             return exact
         noise = self.density.draw_noise(self.context, ENTROPY_PAIRS)
-        noise = th.cat([noise, -noise])
-        log_prob = self.density.rsample_and_log_prob(self.context, noise)[1]
-        ladj = standard_normal_log_prob(noise) - log_prob
-        return self.density.noise_dim * STANDARD_NORMAL_ENTROPY + ladj.mean(0)
+        return estimate_entropy(self.density, self.context, noise)
 
     def sample(self) -> th.Tensor:
         """Draw a reparametrized sample, shape (batch, D)."""
@@ -77,3 +76,24 @@ class ActionDistributionAdapter(Distribution):
         """Condition on ``context``, sample and score: (batch, D) and (batch,)."""
         self.context = context
         return self.density.rsample_and_log_prob(context, self.density.draw_noise(context))
+
+
+def estimate_entropy(
+    density: ActionDistribution, context: th.Tensor, noise: th.Tensor
+) -> th.Tensor:
+    """Estimate the entropy, with gradient: that of the noise plus the mean log-determinant.
+
+    Noise is used with both signs, which cancels the terms of the error that are odd in it.
+
+    Args:
+        density: The density.
+        context: Features, (batch, H).
+        noise: Standard normals, (K, batch, M).
+
+    Returns:
+        Entropy in nats, (batch,).
+    """
+    noise = th.cat([noise, -noise])
+    log_prob = density.rsample_and_log_prob(context, noise)[1]
+    ladj = standard_normal_log_prob(noise) - log_prob
+    return density.noise_dim * STANDARD_NORMAL_ENTROPY + ladj.mean(0)

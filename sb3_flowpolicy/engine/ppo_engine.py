@@ -1,0 +1,184 @@
+"""The engine of PPO: binds a policy to one flat tensor, acts, updates, and releases it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, took_equal_steps
+from sb3_flowpolicy.engine.compiling import Compiled
+from sb3_flowpolicy.engine.engine import MODE_DEPENDENT
+from sb3_flowpolicy.engine.flat import FlatParameters
+from sb3_flowpolicy.engine.ppo_update import (
+    PPO_LOSSES,
+    PPOBatch,
+    PPOSettings,
+    PPOState,
+    make_ppo_update,
+    policy_function,
+)
+from sb3_flowpolicy.engine.update import Moments
+from sb3_flowpolicy.policies.base import check_finite
+from sb3_flowpolicy.policies.on_policy import DensityActorCritic
+
+
+def why_ppo_unsupported(model: PPO) -> str | None:
+    """Return what about a model the engine does not support; None if it supports everything."""
+    policy, optimizer = model.policy, model.policy.optimizer
+    if not isinstance(policy, DensityActorCritic):
+        return f"policy of type {type(policy).__name__}"
+    if type(model.rollout_buffer) is not RolloutBuffer:
+        return f"rollout buffer of type {type(model.rollout_buffer).__name__}"
+    for module in policy.modules():
+        if isinstance(module, MODE_DEPENDENT):
+            return f"layer of type {type(module).__name__}"
+    for parameter in policy.parameters():
+        if not parameter.requires_grad or parameter._backward_hooks:
+            return "parameters that are frozen or have hooks"
+    if adam_settings(optimizer) is None:
+        return f"optimizer of type {type(optimizer).__name__} with these settings"
+    if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
+        return "optimizer with hooks"
+    if not took_equal_steps(optimizer):
+        return "optimizer of which a part was reset"
+    return None
+
+
+def _settings(model: PPO) -> PPOSettings:
+    adam = adam_settings(model.policy.optimizer)
+    assert adam is not None
+    return PPOSettings(
+        adam,
+        model.ent_coef,
+        model.vf_coef,
+        model.max_grad_norm,
+        model.normalize_advantage,
+        model.clip_range_vf is not None,
+        model.target_kl,
+    )
+
+
+class PPOEngine:
+    """Acts with and updates one policy, whose parameters become views of its tensor.
+
+    Args:
+        model: A model for which :func:`why_ppo_unsupported` returns None.
+        compiled: Whether to compile. Where no compiler works, everything runs eagerly, with one
+            warning and the same numbers.
+    """
+
+    def __init__(self, model: PPO, compiled: bool = True) -> None:
+        policy = model.policy
+        assert isinstance(policy, DensityActorCritic)
+        self.model, self.policy, self.optimizer = model, policy, policy.optimizer
+        names = {f"policy.{name}": [value] for name, value in policy.named_parameters()}
+        self.flat = FlatParameters([names])
+        self.adam = FlatAdam(self.flat, [policy.optimizer])
+        self.settings = _settings(model)
+        device = self.flat.data.device
+        update = make_ppo_update(policy, self.flat, self.settings)
+        self._update = Compiled(update, "the PPO update", device)
+        act = policy_function(policy, self.flat, "sample_and_score")
+        self._act = Compiled(act, "the policy", device)
+        self.compiled = compiled
+
+    def fits(self) -> bool:
+        """Whether the model still has the same policy, optimizer and constants."""
+        same = self.model.policy is self.policy and self.policy.optimizer is self.optimizer
+        return same and self.settings == _settings(self.model)
+
+    def synchronize(self) -> None:
+        """Take over parameters or optimizer states that were replaced since the last call."""
+        for part in (self.flat, self.adam):
+            if not part.is_bound():
+                part.bind()
+
+    def release(self) -> None:
+        """Give the policy and its optimizer memory of their own."""
+        self.flat.release()
+        self.adam.release()
+
+    @contextmanager
+    def collecting(self) -> Iterator[None]:
+        """Let the policy's ``forward`` run compiled within this context."""
+        self.policy.forward = self.act  # type: ignore[method-assign]
+        try:
+            yield
+        finally:
+            del self.policy.forward
+
+    @th.no_grad()
+    def act(
+        self, obs: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Return actions, values and log-probabilities, as the policy's ``forward`` does."""
+        if deterministic:
+            return type(self.policy).forward(self.policy, obs, deterministic)
+        noise = self.policy.draw_noise(len(obs))
+        function = self._act if self.compiled else _eager(self._act)
+        actions, values, log_prob = function((obs.shape, obs.dtype), self.flat.data, obs, noise)
+        check_finite(actions.cpu().numpy())
+        return actions, values, log_prob
+
+    def train(self, clip_range: float, clip_range_vf: float) -> dict[str, list[float]]:
+        """Do the updates of one rollout.
+
+        Args:
+            clip_range: Bound on the change of an action's probability ratio.
+            clip_range_vf: Bound on the change of values, if the model clips them.
+
+        Returns:
+            Name -> one number per minibatch, of ``PPO_LOSSES``; the estimates of the KL divergence
+            are those of the last epoch, as in SB3.
+
+        Raises:
+            ValueError: If a log-probability is not finite: that minibatch changed nothing.
+        """
+        model, target_kl = self.model, self.settings.target_kl
+        rate = self.optimizer.param_groups[0]["lr"]
+        scalars = th.tensor([rate, clip_range, clip_range_vf], dtype=th.float64)
+        scalars = scalars.to(self.flat.data.device)
+        state = PPOState(self.flat.data, Moments(self.adam.mean, self.adam.square, self.adam.step))
+        found: list[th.Tensor] = []
+        start_of_epoch, stopped = 0, False
+        for epoch in range(model.n_epochs):
+            start_of_epoch = len(found)
+            for samples in model.rollout_buffer.get(model.batch_size):
+                found.append(self._update_once(state, samples, scalars))
+                if target_kl is not None and found[-1][3] > 1.5 * target_kl:
+                    stopped = True
+                    break
+            model._n_updates += 1
+            if stopped:
+                if model.verbose >= 1:
+                    kl = float(found[-1][3])
+                    print(f"Early stopping at step {epoch} due to reaching max kl: {kl:.2f}")
+                break
+        columns = th.stack(found).T.cpu()
+        check_finite(columns[-1].numpy() / columns[-1].numpy(), "log-probabilities")
+        losses = dict(zip(PPO_LOSSES, columns.tolist(), strict=False))
+        losses["approx_kl"] = losses["approx_kl"][start_of_epoch:]
+        return losses
+
+    def _update_once(
+        self, state: PPOState, samples: RolloutBufferSamples, scalars: th.Tensor
+    ) -> th.Tensor:
+        noise = None
+        if self.settings.ent_coef:
+            noise = self.policy.draw_entropy_noise(len(samples.actions))
+        batch = PPOBatch(*samples[:6], noise)
+        function = self._update
+        # The rest of a rollout that does not fill a minibatch is not worth a graph of its own.
+        if not self.compiled or len(samples.actions) != self.model.batch_size:
+            function = _eager(function)
+        return function(len(samples.actions), state, batch, scalars)
+
+
+def _eager(compiled: Compiled) -> Any:
+    return lambda key, *arguments: compiled.function(*arguments)
