@@ -109,7 +109,7 @@ def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
     Args:
         distribution: Name of a registered density.
         name: One of ``CASES``.
-        updates: Number of updates, a multiple of 100.
+        updates: Number of updates.
 
     Example:
         >>> run_case("gaussian", "batch of 1", updates=100).failure
@@ -119,7 +119,7 @@ def run_case(distribution: str, name: str, updates: int = UPDATES) -> Outcome:
     logs, losses, largest = [], [], 0.0
     for done in range(0, updates, UPDATES_PER_CHECK):
         try:
-            model.train(UPDATES_PER_CHECK, model.batch_size)
+            model.train(min(UPDATES_PER_CHECK, updates - done), model.batch_size)
             model._guard.look()
         except NonFiniteError as error:
             return Outcome(distribution, name, done, str(error))

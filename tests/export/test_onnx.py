@@ -81,7 +81,6 @@ def run(path: Path, outputs: list[str], feed: dict[str, np.ndarray]) -> list[np.
     [
         ("Gauss", ""),
         ("LowRank", ""),
-        ("Flow", ""),
         ("Flow", "MultiInput"),
         # Densities that have no policy class of their own.
         ("lattice", ""),
