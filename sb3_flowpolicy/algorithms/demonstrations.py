@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
@@ -109,22 +108,15 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
         ValueError: If the file does not exist, an array is missing, empty or not finite, or
             lengths differ.
     """
-    if isinstance(source, Mapping):
-        arrays = source
-    else:
-        try:
-            with np.load(source, allow_pickle=False) as file:
-                arrays = {key: file[key] for key in KEYS if key in file}
-        # On damaged files numpy, zipfile and zlib raise many types of exceptions.
-        except Exception as error:
-            raise ValueError(
-                f"demonstrations must be arrays or an .npz file of arrays of numbers, got "
-                f"{str(source)!r} ({type(error).__name__}: {error})"
-            ) from error
-    missing = [key for key in KEYS if key not in arrays]
-    if missing:
-        raise ValueError(f"demonstrations must have the arrays {list(KEYS)}, got {list(arrays)}")
-    arrays = {key: np.asarray(arrays[key]) for key in KEYS}
+    try:
+        with nullcontext(source) if isinstance(source, Mapping) else np.load(source) as found:
+            arrays = {key: np.asarray(found[key]) for key in KEYS}
+    # On damaged files numpy, zipfile and zlib raise many types of exceptions.
+    except Exception as error:
+        raise ValueError(
+            f"demonstrations must be arrays or an .npz file of arrays of numbers, {list(KEYS)}, "
+            f"got {str(source)[:200]!r} ({type(error).__name__}: {error})"
+        ) from error
     for key, array in arrays.items():
         if array.dtype.kind not in "biuf" or not all_finite(array):
             raise ValueError(
@@ -141,7 +133,7 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
 
 
 def fill_replay_buffer(
-    buffer: ReplayBuffer, policy: BasePolicy, demonstrations: Mapping[str, np.ndarray]
+    buffer: ReplayBuffer | None, policy: BasePolicy, demonstrations: Mapping[str, np.ndarray]
 ) -> int:
     """Append demonstrations, as of :func:`load_demonstrations`, to a replay buffer.
 
@@ -154,11 +146,11 @@ def fill_replay_buffer(
     Raises:
         ValueError: If the demonstrations do not fit the buffer or the spaces.
     """
-    if isinstance(buffer, HerReplayBuffer | DictReplayBuffer) or buffer.optimize_memory_usage:
+    takes_arrays = buffer is not None and not isinstance(buffer, DictReplayBuffer)
+    if not takes_arrays or buffer.optimize_memory_usage:
         raise ValueError(
-            "demonstrations need a replay buffer for array observations that stores "
-            f"next observations, got {type(buffer).__name__} with "
-            f"optimize_memory_usage={buffer.optimize_memory_usage}"
+            "demonstrations need a replay buffer for array observations, with "
+            f"optimize_memory_usage=False, got {buffer}"
         )
     n_rows, n_envs = len(demonstrations["actions"]), buffer.n_envs
     per_env = n_rows // n_envs

@@ -9,9 +9,16 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flowpolicy.algorithms.noise_process import NoiseProcess, check_color
+from sb3_flowpolicy.algorithms.noise_process import MAX_COLOR, NoiseProcess
+from sb3_flowpolicy.common.validation import Check, number, optional
 from sb3_flowpolicy.common.vec_env import BatchedVecEnv
 from sb3_flowpolicy.policies import FlowActor
+
+SETTINGS: dict[str, Check] = {
+    "action_noise_color": number(0, MAX_COLOR),
+    "action_noise_correlation_time": optional(number(0, above=True)),
+}
+"""Attributes of an agent, with their checks."""
 
 
 class ColoredExploration:
@@ -41,8 +48,26 @@ class ColoredExploration:
         Raises:
             ValueError: If settings are out of range, or the policy has no density of ours.
         """
-        new = make_process(agent, n_envs, env)
-        if new is None or self.process is None or self.process.settings != new.settings:
+        color, correlation_time = (
+            check(name, getattr(agent, name)) for name, check in SETTINGS.items()
+        )
+        if color == 0 and correlation_time is None:
+            self.process = None
+            return
+        if color != 0 and correlation_time is not None:
+            raise ValueError(
+                "action_noise_color must be 0 where action_noise_correlation_time is given, "
+                f"got {color} and {correlation_time}"
+            )
+        actor = agent.policy.actor
+        if not isinstance(actor, FlowActor):
+            raise ValueError(
+                "action_noise_color must be 0 unless the policy is one of sb3_flowpolicy's with "
+                f"use_sde=False, got {color} with {type(actor).__name__}"
+            )
+        horizon = _episode_length(env)
+        new = NoiseProcess(actor.density.noise_dim, n_envs, color, correlation_time, horizon)
+        if self.process is None or self.process.settings != new.settings:
             self.process = new
 
     def next(self) -> th.Tensor | None:
@@ -63,26 +88,6 @@ class ColoredExploration:
         """Restore what :meth:`state` returned."""
         if self.process is not None and state is not None:
             self.process.set_state(state)
-
-
-def make_process(agent: OffPolicyAlgorithm, n_envs: int, env: Any) -> NoiseProcess | None:
-    """Return a noise process with an agent's settings; None for white noise.
-
-    Raises:
-        ValueError: If settings are out of range, or the policy has no density of ours.
-    """
-    color, correlation_time = agent.action_noise_color, agent.action_noise_correlation_time  # type: ignore[attr-defined]
-    check_color(color, correlation_time, "action_noise_")
-    if color == 0 and correlation_time is None:
-        return None
-    actor = agent.policy.actor
-    if not isinstance(actor, FlowActor):
-        raise ValueError(
-            "action_noise_color must be 0 unless the policy is one of sb3_flowpolicy's with "
-            f"use_sde=False, got {color} with {type(actor).__name__}"
-        )
-    noise_dim = actor.density.noise_dim
-    return NoiseProcess(noise_dim, n_envs, color, correlation_time, _episode_length(env))
 
 
 def _episode_length(env: Any) -> int | None:

@@ -8,8 +8,6 @@ from functools import lru_cache
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.common.validation import is_number
-
 MAX_COLOR = 1.5
 """Largest exponent of the spectrum."""
 DEFAULT_HORIZON = 1000
@@ -35,10 +33,6 @@ class NoiseProcess:
         horizon: Steps of an episode, at least 2: the spectrum follows the power law for
             frequencies from 1/horizon to 1/2 and is flat below.
 
-    Raises:
-        ValueError: If an argument is out of range, or both a color and a correlation time are
-            given.
-
     References:
         Pink Noise Is All You Need (Eberhard et al., 2023); thesis chapter 4 on Brownian motion as
         what independent steps amount to.
@@ -57,10 +51,7 @@ class NoiseProcess:
         correlation_time: float | None = None,
         horizon: int | None = None,
     ) -> None:
-        check_color(color, correlation_time)
         horizon = DEFAULT_HORIZON if horizon is None else horizon
-        if horizon < 2:
-            raise ValueError(f"horizon must be at least 2 steps, got {horizon}")
         #: What it was made of: two processes with the same settings have the same distribution.
         self.settings = (noise_dim, n_envs, color, correlation_time, horizon)
         if correlation_time is not None:
@@ -104,34 +95,8 @@ class NoiseProcess:
         return {"values": self._values.clone(), "starting": self._starting.clone()}
 
     def set_state(self, state: dict[str, th.Tensor]) -> None:
-        """Restore what :meth:`state` returned.
-
-        Raises:
-            ValueError: If the state belongs to a process of another size.
-        """
-        if state["values"].shape != self._values.shape:
-            raise ValueError(
-                f"state must have shape {tuple(self._values.shape)}, "
-                f"got {tuple(state['values'].shape)}"
-            )
+        """Restore what :meth:`state` returned."""
         self._values, self._starting = state["values"].clone(), state["starting"].clone()
-
-
-def check_color(color: float, correlation_time: float | None, prefix: str = "") -> None:
-    """Raise ``ValueError`` unless these describe a process; names get a prefix in messages."""
-    if not is_number(color) or not 0 <= color <= MAX_COLOR:
-        raise ValueError(f"{prefix}color must be between 0 (white) and {MAX_COLOR}, got {color!r}")
-    if correlation_time is None:
-        return
-    if not is_number(correlation_time) or not 0 < correlation_time < math.inf:
-        raise ValueError(
-            f"{prefix}correlation_time must be above 0 steps, got {correlation_time!r}"
-        )
-    if color != 0:
-        raise ValueError(
-            f"{prefix}color must be 0 where {prefix}correlation_time is given, "
-            f"got {color} and {correlation_time}"
-        )
 
 
 @lru_cache(maxsize=8)

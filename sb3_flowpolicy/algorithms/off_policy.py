@@ -17,8 +17,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flowpolicy.algorithms.exploration import ColoredExploration, make_process
-from sb3_flowpolicy.algorithms.noise_process import MAX_COLOR
+from sb3_flowpolicy.algorithms import exploration
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
@@ -61,8 +61,7 @@ SETTINGS: dict[str, Check] = {
     "use_sde_at_warmup": flag,
     "stats_window_size": integer(1),
     "seed": optional(integer(0, 2**32 - 1)),
-    "action_noise_color": number(0, MAX_COLOR),
-    "action_noise_correlation_time": optional(number(0, above=True)),
+    **exploration.SETTINGS,
 }
 """Arguments of an off-policy algorithm that are plain values, with their checks."""
 
@@ -224,7 +223,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        make_process(self, self.n_envs, self.env)  # validates
+        self._exploration.fit(self, self.n_envs, self.env)  # validates
 
     def _setup_learn(
         self,

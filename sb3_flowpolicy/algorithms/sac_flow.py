@@ -25,7 +25,7 @@ from sb3_flowpolicy.algorithms.demonstrations import (
 )
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
-from sb3_flowpolicy.common.validation import check_settings, either, flag, number, optional
+from sb3_flowpolicy.common.validation import check_settings, either, flag, integer, number, optional
 from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
 from sb3_flowpolicy.guard.finite import check_observation
 from sb3_flowpolicy.policies import sac
@@ -92,7 +92,7 @@ class SACFlow(OffPolicyFlow, SAC):
     policy_class_of_stock = SACPolicy
     settings: ClassVar = {
         **SETTINGS,
-        "random_steps": optional(number(0)),
+        "random_steps": optional(integer(0)),
         "critic_loss_coef": number(0, above=True),
         "compile": either("auto", flag),
         "autocast": flag,
@@ -148,11 +148,8 @@ class SACFlow(OffPolicyFlow, SAC):
             ValueError: If arrays are missing or of different lengths, do not fit into the
                 buffer, or the buffer is of a kind that cannot take them.
         """
-        if self.replay_buffer is None:
-            raise ValueError("demonstrations need a model that has its replay buffer, got None")
-        return fill_replay_buffer(
-            self.replay_buffer, self.policy, load_demonstrations(demonstrations)
-        )
+        rows = load_demonstrations(demonstrations)
+        return fill_replay_buffer(self.replay_buffer, self.policy, rows)
 
     def save_safe(self, path: str | Path, vec_normalize: VecNormalize | None = None) -> Path:
         """Write a safe bundle: one file to share, as loading it executes no code.
@@ -295,8 +292,6 @@ class SACFlow(OffPolicyFlow, SAC):
             NonFiniteError: If a loss is not finite; weights are then as they were when the guard
                 last checked them.
         """
-        if gradient_steps == 0:
-            return
         with self._runtime.running():
             engine = self._runtime.engine()
             if engine is None:

@@ -130,7 +130,8 @@ def test_loaded_model_needs_no_demonstrations(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"random_steps": -1}, "random_steps must be None or at least 0, got -1"),
+        ({"random_steps": 1.5}, "random_steps must be None or an integer of at least 0, got 1.5"),
+        ({"random_steps": -1}, "random_steps must be None or an integer of at least 0, got -1"),
         ({"critic_loss_coef": 0.0}, "critic_loss_coef must be above 0, got 0.0"),
         ({"critic_loss_coef": float("nan")}, "critic_loss_coef must be finite, got nan"),
         ({"demonstrations": "nowhere.npz"}, "got 'nowhere.npz' .*No such file"),
