@@ -146,8 +146,7 @@ def fill_replay_buffer(
     Raises:
         ValueError: If the demonstrations do not fit the buffer or the spaces.
     """
-    takes_arrays = buffer is not None and not isinstance(buffer, DictReplayBuffer)
-    if not takes_arrays or buffer.optimize_memory_usage:
+    if buffer is None or isinstance(buffer, DictReplayBuffer) or buffer.optimize_memory_usage:
         raise ValueError(
             "demonstrations need a replay buffer for array observations, with "
             f"optimize_memory_usage=False, got {buffer}"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3 import SAC
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -82,7 +82,9 @@ class Normalization:
         return wrapped
 
 
-def normalization_of(model: SAC, vec_normalize: VecNormalize | None = None) -> Normalization | None:
+def normalization_of(
+    model: OffPolicyAlgorithm, vec_normalize: VecNormalize | None = None
+) -> Normalization | None:
     """Return the given statistics, those of a model's environment, those of its bundle, or None."""
     live = vec_normalize if vec_normalize is not None else model.get_vec_normalize_env()
     return Normalization.of(live) if live is not None else getattr(model, "normalization", None)

@@ -35,7 +35,7 @@ class RunCheckpointCallback(BaseCallback):
     ) -> None:
         super().__init__()
         self.checkpoint_every = integer(1)("checkpoint_every", checkpoint_every)
-        self.checkpoint_path = checkpoint_path
+        self.checkpoint_path = Path(checkpoint_path)
         self.resume = resume
 
     def _init_callback(self) -> None:

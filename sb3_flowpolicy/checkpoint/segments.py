@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -125,13 +125,3 @@ def fill(columns: Mapping[str, np.ndarray], folder: Path, segments: Sequence[Seg
         with np.load(folder / segment.file, allow_pickle=False) as rows:
             for name, column in columns.items():
                 column[np.arange(segment.first, segment.end) % len(column)] = rows[name]
-
-
-def to_json(segments: Sequence[Segment]) -> list[dict[str, Any]]:
-    """Describe files for the manifest of a checkpoint."""
-    return [asdict(segment) for segment in segments]
-
-
-def from_json(described: Sequence[Mapping[str, Any]]) -> list[Segment]:
-    """Undo :func:`to_json`."""
-    return [Segment(**one) for one in described]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_flowpolicy.checkpoint import segments, state
 from sb3_flowpolicy.checkpoint.environments import check_same_build, layers
-from sb3_flowpolicy.checkpoint.segments import RowFiles
+from sb3_flowpolicy.checkpoint.segments import RowFiles, Segment
 from sb3_flowpolicy.checkpoint.signals import StopSignals
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.checkpoint.store import Checkpoint, CheckpointStore
@@ -116,11 +117,11 @@ class RunCheckpoints:
                 self._last = self._run().first.num_timesteps
             else:
                 store = CheckpointStore(path)
-                if store.folders():
+                if path.is_file() or store.folders():
+                    found = f"which holds {store.folders()[-1].name}: resume that run, or choose"
                     raise ValueError(
-                        f"checkpoint_path must be an empty folder for a new run, got {path}, which "
-                        f"holds {store.folders()[-1].name}: resume that run, or choose another "
-                        "folder"
+                        f"checkpoint_path must be an empty folder for a new run, got {path}, "
+                        + ("a file" if path.is_file() else f"{found} another folder")
                     )
                 self._store, self._rows, self._last = store, RowFiles(), None
                 self._resumed_from = None
@@ -198,7 +199,7 @@ class RunCheckpoints:
                     "buffer_size must be as when the checkpoint was written, "
                     f"{manifest['capacity']} steps of each environment, got {ring.capacity}"
                 )
-            files = segments.from_json(manifest["segments"])
+            files = [Segment(**one) for one in manifest["segments"]]
             segments.fill(ring.columns, checkpoint.rows_folder, files)
             source.pos, source.full = manifest["pos"], manifest["full"]
             self._rows = RowFiles(source, files, run.first.num_timesteps // run.first.n_envs)
@@ -228,7 +229,7 @@ class RunCheckpoints:
             source, ring = found
             files = self._rows.update(source, ring, now // run.first.n_envs, new_rows)
             facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
-            return {"segments": segments.to_json(files), **facts}
+            return {"segments": [asdict(one) for one in files], **facts}
 
         try:
             self._store.write(now, _facts(run), write_files)

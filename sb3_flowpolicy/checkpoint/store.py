@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,27 +67,32 @@ class CheckpointStore:
         Raises:
             ValueError: If there is none, or it was written in a later format.
         """
-        folders = self.folders()
-        damages = []
-        for folder in reversed(folders):
+        checkpoint, damages = self._search()
+        damaged = "; ".join(damages)
+        if checkpoint is None:
+            found = f"only damaged ones ({damaged})" if damages else "no checkpoint"
+            raise ValueError(
+                f"path must be a folder of checkpoints, got {str(self.path)!r}, which has {found}"
+            )
+        if damages:
+            warnings.warn(
+                f"resuming from {checkpoint.folder}, because newer checkpoints are damaged "
+                f"({damaged})",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+        self._good = [checkpoint]
+        return checkpoint
+
+    def _search(self) -> tuple[Checkpoint | None, list[str]]:
+        """Return the newest undamaged checkpoint, and what is wrong with newer ones."""
+        damages: list[str] = []
+        for folder in reversed(self.folders()):
             try:
-                checkpoint = Checkpoint(folder, _read_manifest(folder))
+                return Checkpoint(folder, _read_manifest(folder)), damages
             except _DamagedError as damage:
                 damages.append(f"{folder.name}: {damage}")
-                continue
-            if damages:
-                warnings.warn(
-                    f"resuming from {folder}, because newer checkpoints are damaged "
-                    f"({'; '.join(damages)})",
-                    RuntimeWarning,
-                    stacklevel=3,
-                )
-            self._good = [checkpoint]
-            return checkpoint
-        found = f"only damaged ones ({'; '.join(damages)})" if damages else "no checkpoint"
-        raise ValueError(
-            f"path must be a folder of checkpoints, got {str(self.path)!r}, which has {found}"
-        )
+        return None, damages
 
     def write(
         self,
@@ -153,7 +158,7 @@ def has_checkpoint(path: str | Path) -> bool:
         >>> has_checkpoint("no/such/folder")
         False
     """
-    return any(not _damage(folder) for folder in reversed(CheckpointStore(path).folders()))
+    return CheckpointStore(path)._search()[0] is not None
 
 
 def _number(folder: Path) -> int:
@@ -162,14 +167,6 @@ def _number(folder: Path) -> int:
 
 class _DamagedError(Exception):
     """A checkpoint disagrees with its manifest."""
-
-
-def _damage(folder: Path) -> str:
-    try:
-        _read_manifest(folder)
-    except _DamagedError as damage:
-        return str(damage)
-    return ""
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
@@ -205,13 +202,9 @@ def _digest(path: Path, synchronize: bool = False) -> str:
         _synchronize(path)
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        for block in _blocks(file):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _blocks(file: Any) -> Iterable[bytes]:
-    return iter(lambda: file.read(1 << 20), b"")
 
 
 def _synchronize(path: Path) -> None:

@@ -34,6 +34,7 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
             ``action_dim``, ``context_dim`` and keyword arguments of its own.
 
     Raises:
+        TypeError: If the class is not a density.
         ValueError: If the name is taken.
 
     Example:
@@ -47,6 +48,11 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
         >>> make_distribution("sharp", action_dim=2, context_dim=8).action_dim
         2
     """
+    if not isinstance(name, str) or not issubclass(distribution_class, ActionDistribution):
+        raise TypeError(
+            "a density must be registered as a name and a subclass of ActionDistribution, got "
+            f"{name!r} and {distribution_class!r}"
+        )
     if _REGISTRY.get(name, distribution_class) is not distribution_class:
         raise ValueError(f'name "{name}" is taken by {_REGISTRY[name].__name__}')
     _REGISTRY[name] = distribution_class
@@ -67,4 +73,7 @@ def make_distribution(
         TypeError: If the density's constructor takes no such keyword argument.
     """
     one_of(*_REGISTRY)("distribution", name)
-    return _REGISTRY[name](action_dim, context_dim, **distribution_kwargs)
+    try:
+        return _REGISTRY[name](action_dim, context_dim, **distribution_kwargs)
+    except TypeError as error:
+        raise TypeError(f'distribution "{name}": {error}') from error

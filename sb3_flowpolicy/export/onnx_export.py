@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import SAC
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy.bundle.model import made_with
@@ -29,7 +29,7 @@ _N_CHECKED = 64
 
 
 def export_onnx(
-    model: SAC,
+    model: OffPolicyAlgorithm,
     path: str | Path,
     *,
     stochastic: bool = False,
@@ -43,7 +43,7 @@ def export_onnx(
     compared with those of ``predict``.
 
     Args:
-        model: ``SACFlow``, or SB3's ``SAC`` with one of our policies.
+        model: ``SACFlow``, ``TQCFlow``, ``CrossQFlow``, or a stock one with one of our policies.
         path: File to write, ``.onnx`` if it has no suffix.
         stochastic: Whether to sample as well: with a further input ``noise`` of independent
             standard normals, (batch, M), and a further output ``sampled_action``.
@@ -132,7 +132,9 @@ def _quietly() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _add_metadata(proto: Any, model: SAC, normalized: bool, stochastic: bool) -> None:
+def _add_metadata(
+    proto: Any, model: OffPolicyAlgorithm, normalized: bool, stochastic: bool
+) -> None:
     """Describe inputs, outputs and origin for users who have only the file."""
     policy: Any = model.policy
     facts: dict[str, Any] = {

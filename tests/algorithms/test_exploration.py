@@ -190,7 +190,10 @@ def test_a_batch_explores_in_the_same_way() -> None:
     [
         ({"action_noise_color": -1}, "action_noise_color must be"),
         ({"action_noise_color": "pink"}, "action_noise_color must be"),
-        ({"action_noise_correlation_time": 0.0}, "action_noise_correlation_time must be None or above 0"),
+        (
+            {"action_noise_correlation_time": 0.0},
+            "action_noise_correlation_time must be None or above 0",
+        ),
         (
             {"action_noise_color": 1.0, "action_noise_correlation_time": 3.0},
             "action_noise_color must be 0 where action_noise_correlation_time is given",

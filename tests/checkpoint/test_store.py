@@ -154,6 +154,16 @@ def test_a_tunnel_of_another_width_is_another_environment(run: Path) -> None:
         SACFlow.resume(run, gym.make(ENV, width=0.5))
 
 
+def test_the_folder_must_be_a_path_to_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"must be an empty folder .*file, a file"):
+        SACFlow("FlowPolicy", ENV, **FAST).learn(
+            20, checkpoint_every=10, checkpoint_path=tmp_path / "file"
+        )
+    with pytest.raises(TypeError, match="NoneType"):
+        RunCheckpointCallback(5, None)  # type: ignore[arg-type]
+
+
 def test_a_replay_buffer_of_another_size_is_refused(run: Path) -> None:
     model = SACFlow("FlowPolicy", ENV, **{**FAST, "buffer_size": 70})
     with pytest.raises(ValueError, match=r"buffer_size must be .* 60 steps .*, got 70"):

@@ -20,7 +20,7 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy import FlowPolicy, SACFlow, export_onnx
+from sb3_flowpolicy import CrossQFlow, FlowPolicy, SACFlow, TQCFlow, export_onnx
 from sb3_flowpolicy.distributions import registered_distributions
 from sb3_flowpolicy.export import onnx_export
 from tests.bundle.conftest import FAST, NET
@@ -220,3 +220,9 @@ def test_the_example_runs_without_torch(tmp_path: Path) -> None:
     for options in ([], ["--sample"]):
         result = subprocess.run([*command, *options], capture_output=True, text=True, check=True)
         assert "TunnelDiagonal-v0: success" in result.stdout
+
+
+@pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
+def test_other_off_policy_algorithms(algorithm: Any, tmp_path: Path) -> None:
+    model = algorithm("FlowPolicy", "Pendulum-v1", policy_kwargs=NET, **FAST)
+    assert export_onnx(model, tmp_path / "policy").is_file()
