@@ -114,8 +114,8 @@ def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[s
     # On damaged files numpy, zipfile and zlib raise many types of exceptions.
     except Exception as error:
         raise ValueError(
-            f"demonstrations must be arrays or an .npz file of arrays of numbers, {list(KEYS)}, "
-            f"got {str(source)[:200]!r} ({type(error).__name__}: {error})"
+            f"demonstrations must be arrays or an .npz file of arrays of numbers, got "
+            f"{str(source)[:200]!r} ({type(error).__name__}: {error})"
         ) from error
     for key, array in arrays.items():
         if array.dtype.kind not in "biuf" or not all_finite(array):

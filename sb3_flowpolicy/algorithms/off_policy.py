@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flowpolicy.algorithms import exploration
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
-from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
+from sb3_flowpolicy.checkpoint.segments import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import (
@@ -310,12 +310,12 @@ class OffPolicyFlow(OffPolicyAlgorithm):
             set_extra=self._load_run_state,
         )
 
-    def _ring(self) -> tuple[RingOwner, Ring] | None:
+    def _ring(self) -> Ring | None:
         buffer = self.replay_buffer
         if buffer is None or not is_plain(buffer):
             return None
         columns = {name: getattr(buffer, name) for name in COLUMNS}
-        return buffer, Ring(columns, buffer.pos, buffer.full)
+        return Ring(columns, buffer.pos, buffer.full, buffer)
 
     def _stateful_parts(self) -> dict[str, Any]:
         """Name the parts that have a state of their own: ``state()`` and ``load_state()``."""

@@ -5,19 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 # Small files are merged into the next one up to this size: few files, and little written twice.
 _MERGED_BYTES = 16_000_000
-
-
-class RingOwner(Protocol):
-    """A replay buffer with the position of its next row."""
-
-    pos: int
-    full: bool
 
 
 @dataclass(frozen=True)
@@ -28,11 +20,13 @@ class Ring:
         columns: Name -> array, (capacity, ...).
         pos: Where the next row goes.
         full: Whether all rows are filled.
+        source: The object that it belongs to, to detect that it was replaced.
     """
 
     columns: Mapping[str, np.ndarray]
     pos: int
     full: bool
+    source: object
 
     @property
     def capacity(self) -> int:
@@ -68,24 +62,23 @@ class RowFiles:
     """Files that together hold a ring as it was at the last checkpoint.
 
     Args:
-        source: The buffer that the ring belongs to, to detect that it was replaced.
+        source: The ring's source.
         segments: The files, oldest rows first.
         steps: Rows that had been added in the life of the agent.
     """
 
     def __init__(
-        self, source: RingOwner | None = None, segments: Sequence[Segment] = (), steps: int = 0
+        self, source: object = None, segments: Sequence[Segment] = (), steps: int = 0
     ) -> None:
         self.source = source
         self.segments = list(segments)
         self.steps = steps
 
-    def update(self, source: RingOwner, ring: Ring, steps: int, path: Path) -> list[Segment]:
+    def update(self, ring: Ring, steps: int, path: Path) -> list[Segment]:
         """Write the new rows; all rows, unless ``steps`` explains how the ring has moved.
 
         Args:
-            source: The buffer that the ring belongs to.
-            ring: Its contents.
+            ring: The ring as it is now.
             steps: Rows added in the life of the agent.
             path: File for the new rows; not written if there are none.
 
@@ -95,7 +88,7 @@ class RowFiles:
         added = steps - self.steps
         end = self.segments[-1].end + added if self.segments else -1
         follows = (
-            source is self.source
+            ring.source is self.source
             and 0 <= added < ring.capacity
             and end % ring.capacity == ring.pos
             and ring.full == (end >= ring.capacity)
@@ -114,7 +107,7 @@ class RowFiles:
             with path.open("wb") as file:
                 np.savez(file, allow_pickle=False, **ring.rows(first, end))
             kept.append(Segment(path.name, first, end))
-        self.source, self.steps = source, steps
+        self.source, self.steps = ring.source, steps
         self.segments = [segment for segment in kept if segment.end > oldest]
         return self.segments
 

@@ -187,13 +187,12 @@ class RunCheckpoints:
         parts = th.load(checkpoint.folder / _STATE, weights_only=True)
         state.restore_early(run, parts["early"])
         self._rows = RowFiles()
-        found = run.ring()
-        if found is None:
+        ring = run.ring()
+        if ring is None:
             for name, agent in run.agents.items():
                 path = checkpoint.folder / f"{name}.buffer.pkl"
                 agent.load_replay_buffer(path, truncate_last_traj=False)
         else:
-            source, ring = found
             if manifest["capacity"] != ring.capacity:
                 raise ValueError(
                     "buffer_size must be as when the checkpoint was written, "
@@ -201,8 +200,10 @@ class RunCheckpoints:
                 )
             files = [Segment(**one) for one in manifest["segments"]]
             segments.fill(ring.columns, checkpoint.rows_folder, files)
-            source.pos, source.full = manifest["pos"], manifest["full"]
-            self._rows = RowFiles(source, files, run.first.num_timesteps // run.first.n_envs)
+            for agent in run.agents.values():
+                buffer: Any = agent.replay_buffer
+                buffer.pos, buffer.full = manifest["pos"], manifest["full"]
+            self._rows = RowFiles(ring.source, files, run.first.num_timesteps // run.first.n_envs)
         self._late, self._begun, self._resumed_from = parts["late"], manifest["begun"], store
 
     def _run(self, callbacks: Mapping[str, BaseCallback] | None = None) -> Run:
@@ -221,13 +222,12 @@ class RunCheckpoints:
             for name, agent in run.agents.items():
                 agent.save(folder / f"{name}.zip")
             th.save(state.collect(run), folder / _STATE)
-            found = run.ring()
-            if found is None:
+            ring = run.ring()
+            if ring is None:
                 for name, agent in run.agents.items():
                     agent.save_replay_buffer(folder / f"{name}.buffer.pkl")
                 return {}
-            source, ring = found
-            files = self._rows.update(source, ring, now // run.first.n_envs, new_rows)
+            files = self._rows.update(ring, now // run.first.n_envs, new_rows)
             facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
             return {"segments": [asdict(one) for one in files], **facts}
 

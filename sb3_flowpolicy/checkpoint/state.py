@@ -17,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flowpolicy.checkpoint import environments, logs, pickling
-from sb3_flowpolicy.checkpoint.segments import Ring, RingOwner
+from sb3_flowpolicy.checkpoint.segments import Ring
 
 # Attributes of SB3's that its load() leaves out or creates anew, and counters.
 _ATTRIBUTES = (
@@ -43,7 +43,7 @@ class Run:
         kind: Name of the class that can resume it.
         agents: Agents by the name of their files.
         environments: Environments by name.
-        ring: Returns the replay buffer and its contents; None if it is not made of rows.
+        ring: Returns the contents of the replay buffer; None if it is not made of rows.
         extra: Returns the state of the rest.
         set_extra: Restores it.
         callbacks: The callback that each agent's ``learn`` was given, while it runs.
@@ -52,7 +52,7 @@ class Run:
     kind: str
     agents: Mapping[str, OffPolicyAlgorithm]
     environments: Mapping[str, Any]
-    ring: Callable[[], tuple[RingOwner, Ring] | None]
+    ring: Callable[[], Ring | None]
     extra: Callable[[], dict[str, Any]]
     set_extra: Callable[[dict[str, Any]], None]
     callbacks: dict[str, BaseCallback] = field(default_factory=dict)

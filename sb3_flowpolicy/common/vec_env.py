@@ -57,7 +57,7 @@ class BatchedVecEnv(VecEnv):
         """Reset all environments and return their observations, (N, ...)."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         obs, infos = self.venv.reset(seed=seeds)  # type: ignore[arg-type]
-        self.reset_infos = [_of(infos, i) for i in range(self.num_envs)]
+        self.reset_infos = [info_of(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return obs
@@ -73,11 +73,11 @@ class BatchedVecEnv(VecEnv):
         infos = []
         for i in range(self.num_envs):
             if dones[i]:
-                info = _of(batch["final_info"], i)
+                info = info_of(batch["final_info"], i)
                 info["terminal_observation"] = batch["final_obs"][i]
-                self.reset_infos[i] = _of(batch, i)
+                self.reset_infos[i] = info_of(batch, i)
             else:
-                info = _of(batch, i)
+                info = info_of(batch, i)
             info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             infos.append(info)
         return obs, np.asarray(rewards, np.float32), dones, infos
@@ -116,10 +116,18 @@ class BatchedVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-def _of(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """Return one environment's part of a batch's infos."""
+def info_of(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """Return one environment's part of a batch's infos.
+
+    Example:
+        >>> infos = {"x": np.array([1.0, 2.0]), "_x": np.array([True, False])}
+        >>> info_of(infos, 0), info_of(infos, 1)
+        ({'x': 1.0}, {})
+    """
     return {
         name: values[i].item() if isinstance(values[i], np.generic) else values[i]
         for name, values in infos.items()
-        if not name.startswith("_") and name not in ("final_obs", "final_info")
+        if isinstance(values, np.ndarray)
+        and not name.startswith(("_", "final_"))
+        and (f"_{name}" not in infos or infos[f"_{name}"][i])
     }

@@ -48,8 +48,7 @@ class FlatAdam:
 
     def __init__(self, flat: FlatParameters, optimizers: list[th.optim.Optimizer]) -> None:
         settings = adam_settings(optimizers[0])
-        if settings is None:
-            raise ValueError(f"optimizers must be plain Adam or AdamW, got {optimizers[0]!r}")
+        assert settings is not None
         self.settings = settings
         self.flat = flat
         self.optimizers = optimizers

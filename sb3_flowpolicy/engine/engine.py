@@ -66,30 +66,13 @@ def why_unsupported(model: SAC) -> str | None:
 
 
 def settings_key(model: SAC, critic_loss_coef: float) -> tuple[object, ...]:
-    """Return everything that :func:`update_settings` depends on; quick to compare."""
+    """Return all constants of an update, for a quick comparison."""
     groups = [model.actor.optimizer.param_groups[0], model.critic.optimizer.param_groups[0]]
     if model.ent_coef_optimizer is not None:
         groups.append(model.ent_coef_optimizer.param_groups[0])
     names = ("betas", "eps", "weight_decay", "amsgrad", "maximize")
     adam = [group.get(name) for group in groups for name in names]
     return (model.tau, critic_loss_coef, model.target_entropy, *adam)
-
-
-def update_settings(model: SAC, critic_loss_coef: float) -> UpdateSettings:
-    """Return the constants of an update of a model that the engine supports."""
-    actor_adam = adam_settings(model.policy.actor.optimizer)
-    critic_adam = adam_settings(model.policy.critic.optimizer)
-    assert actor_adam is not None
-    assert critic_adam is not None
-    learned = model.ent_coef_optimizer
-    return UpdateSettings(
-        tau=model.tau,
-        critic_loss_coef=critic_loss_coef,
-        target_entropy=float(model.target_entropy),
-        actor_adam=actor_adam,
-        critic_adam=critic_adam,
-        ent_coef_adam=None if learned is None else adam_settings(learned),
-    )
 
 
 class Engine:
@@ -130,7 +113,15 @@ class Engine:
             )
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)  # type: ignore[arg-type]
-        settings = update_settings(first, critic_loss_coef)
+        learned = self.ent_coef_adam
+        settings = UpdateSettings(
+            tau=first.tau,
+            critic_loss_coef=critic_loss_coef,
+            target_entropy=float(first.target_entropy),
+            actor_adam=self.actor_adam.settings,
+            critic_adam=self.critic_adam.settings,
+            ent_coef_adam=None if learned is None else learned.settings,
+        )
         self.critic_loss_coef = critic_loss_coef
         self.settings_key = settings_key(first, critic_loss_coef)
         self._identities = [_identity(model) for model in self.models]

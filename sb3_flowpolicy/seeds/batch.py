@@ -16,10 +16,11 @@ from sb3_flowpolicy.checkpoint.segments import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import number
+from sb3_flowpolicy.common.vec_env import info_of
 from sb3_flowpolicy.engine import LOSSES, EngineRuntime, settings_key
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.episodes import SeedEpisodes
-from sb3_flowpolicy.seeds.experience import SeedExperience, info_of
+from sb3_flowpolicy.seeds.experience import SeedExperience
 from sb3_flowpolicy.seeds.setup import (
     CallbackFactory,
     EnvFactory,
@@ -30,7 +31,6 @@ from sb3_flowpolicy.seeds.setup import (
     make_progress_bar,
     refuse,
 )
-from sb3_flowpolicy.seeds.storage import SeedStorage
 
 SelfBatch = TypeVar("SelfBatch", bound="SeedBatch")
 
@@ -147,7 +147,6 @@ class SeedBatch:
         batch = cls.__new__(cls)
         batch._set_up(agents, env, monitor_dir, info_keywords)
         batch._checkpoints.load(store, checkpoint)
-        batch._experience.storage.publish()
         return batch
 
     def learn(
@@ -202,10 +201,8 @@ class SeedBatch:
                 self._run(callbacks, log_interval, bar)
                 self._guard.look()
             finally:
-                # After an exception, too, the agents are ordinary models again.
                 if bar is not None:
                     bar.close()
-                self._experience.storage.publish()
             for one in callbacks:
                 one.on_training_end()
         return self
@@ -273,12 +270,10 @@ class SeedBatch:
             model.num_timesteps += 1
             model._current_progress_remaining = 1 - model.num_timesteps / model._total_timesteps
         going = True
-        if callbacks:
-            self._experience.storage.publish()
-            for k, one in enumerate(callbacks):
-                info = info_of(infos, k, bool(dones[k]))
-                one.update_locals({"rewards": rewards[[k]], "dones": dones[[k]], "infos": [info]})
-                going = one.on_step() and going
+        for k, one in enumerate(callbacks):
+            info = info_of(infos.get("final_info", {}) if dones[k] else infos, k)
+            one.update_locals({"rewards": rewards[[k]], "dones": dones[[k]], "infos": [info]})
+            going = one.on_step() and going
         self._episodes.step(rewards, dones, infos, log_interval)
         return going
 
@@ -319,9 +314,9 @@ class SeedBatch:
             set_extra=self._set_extra_state,
         )
 
-    def _ring(self) -> tuple[SeedStorage, Ring]:
-        storage = self._experience.storage
-        return storage, Ring(storage.rows.columns, storage.pos, storage.full)
+    def _ring(self) -> Ring:
+        storage, buffer = self._experience.storage, self._experience.storage.buffers[0]
+        return Ring(storage.rows.columns, buffer.pos, buffer.full, storage)
 
     def _extra_state(self) -> dict[str, Any]:
         self._guard.look()  # before a checkpoint is written, not after

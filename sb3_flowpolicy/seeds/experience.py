@@ -44,7 +44,7 @@ class SeedExperience:
         # An agent that was trained on its own has its own buffer since then.
         if not self.storage.rows.holds(self._buffers()):
             self.storage = SeedStorage(self._buffers())
-        self.storage.synchronize()
+        self.storage.check_equally_filled()
         self._fit_noise()
 
     def _fit_noise(self) -> None:
@@ -146,21 +146,3 @@ class SeedExperience:
         for name, one in self._noise.items():
             one.set_state(state["noise"][name])
         self._exploration.load_state(state["exploration"])
-
-
-def info_of(infos: dict[str, Any], index: int, done: bool) -> dict[str, Any]:
-    """Return one environment's info of a step, from those of a vectorized environment.
-
-    Example:
-        >>> infos = {"x": np.array([1.0, 2.0]), "_x": np.array([True, False])}
-        >>> info_of(infos, 0, False), info_of(infos, 1, False)
-        ({'x': 1.0}, {})
-    """
-    own = infos.get("final_info", {}) if done else infos
-    return {
-        name: values[index].item() if values.ndim == 1 and values.dtype != object else values[index]
-        for name, values in own.items()
-        if isinstance(values, np.ndarray)
-        and not name.startswith(("_", "final_"))
-        and own.get(f"_{name}", np.ones(len(values), bool))[index]
-    }

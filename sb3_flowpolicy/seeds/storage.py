@@ -35,34 +35,24 @@ class SeedStorage:
                     f"optimize_memory_usage={buffer.optimize_memory_usage}"
                 )
         self.buffers = list(buffers)
-        self.capacity = buffers[0].buffer_size
-        self.pos, self.full = 0, False
-        self.synchronize()
+        self.check_equally_filled()
         self.rows = ReplayRows(buffers)
         self._seeds = th.arange(len(buffers)).unsqueeze(-1)
 
-    def __len__(self) -> int:
-        """Number of transitions per seed."""
-        return self.capacity if self.full else self.pos
-
-    def add(self, **values: np.ndarray) -> None:
-        """Append one transition per seed; each value has a leading axis S."""
-        for name, value in values.items():
-            self.rows.columns[name][self.pos] = value
-        self.pos = (self.pos + 1) % self.capacity
-        self.full = self.full or self.pos == 0
-
-    def synchronize(self) -> None:
-        """Continue where the models' own buffers end, after demonstrations for example."""
+    def check_equally_filled(self) -> None:
+        """Raise ``ValueError`` unless all seeds have as many transitions."""
         if len({(buffer.pos, buffer.full) for buffer in self.buffers}) > 1:
             sizes = [buffer.size() for buffer in self.buffers]
             raise ValueError(f"replay buffers must be equally filled, got {sizes} transitions")
-        self.pos, self.full = self.buffers[0].pos, self.buffers[0].full
 
-    def publish(self) -> None:
-        """Set the positions of the models' own buffers."""
+    def add(self, **values: np.ndarray) -> None:
+        """Append one transition per seed; each value has a leading axis S."""
+        row, capacity = self.buffers[0].pos, self.buffers[0].buffer_size
+        for name, value in values.items():
+            self.rows.columns[name][row] = value
         for buffer in self.buffers:
-            buffer.pos, buffer.full = self.pos, self.full
+            buffer.pos = (row + 1) % capacity
+            buffer.full = buffer.full or buffer.pos == 0
 
     def gather(self, uniform: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
         """Return n minibatches.
@@ -72,7 +62,7 @@ class SeedStorage:
             gamma: Discount factor.
             noise: Standard normals, (n, 2, S, B, M).
         """
-        index = (uniform * len(self)).long().mul_(len(self.buffers)).add_(self._seeds)
+        index = (uniform * self.buffers[0].size()).long().mul_(len(self.buffers)).add_(self._seeds)
         return self.rows.take(index, gamma, noise)
 
 

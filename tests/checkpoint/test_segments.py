@@ -40,7 +40,7 @@ class Buffer:
             self.full = self.full or self.pos == 0
 
     def ring(self) -> Ring:
-        return Ring(self.columns, self.pos, self.full)
+        return Ring(self.columns, self.pos, self.full, self)
 
 
 def check(buffer: Buffer, folder: Path, files: list[segments.Segment]) -> None:
@@ -63,7 +63,7 @@ def test_the_files_hold_the_ring(before: int, added: list[int], merged: int) -> 
         buffer.add(before)
         for number, count in enumerate([0, *added]):
             buffer.add(count)
-            files = rows.update(buffer, buffer.ring(), buffer.steps, folder / f"{number}.npz")
+            files = rows.update(buffer.ring(), buffer.steps, folder / f"{number}.npz")
             check(buffer, folder, files)
 
 
@@ -71,15 +71,15 @@ def test_only_new_rows_are_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setattr(segments, "_MERGED_BYTES", 0)
     buffer, rows = Buffer(), RowFiles()
     buffer.add(5)
-    rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / "1.npz")
+    rows.update(buffer.ring(), buffer.steps, tmp_path / "1.npz")
     buffer.add(2)
-    files = rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / "2.npz")
+    files = rows.update(buffer.ring(), buffer.steps, tmp_path / "2.npz")
     assert [(one.file, one.first, one.end) for one in files] == [("1.npz", 0, 5), ("2.npz", 5, 7)]
-    rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / "3.npz")
+    rows.update(buffer.ring(), buffer.steps, tmp_path / "3.npz")
     assert not (tmp_path / "3.npz").exists()
     # Rows that have left the ring need no file.
     buffer.add(11)
-    files = rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / "4.npz")
+    files = rows.update(buffer.ring(), buffer.steps, tmp_path / "4.npz")
     assert [one.file for one in files] == ["2.npz", "4.npz"]
 
 
@@ -87,7 +87,7 @@ def test_small_files_are_merged(tmp_path: Path) -> None:
     buffer, rows = Buffer(), RowFiles()
     for number in range(100):
         buffer.add(1)
-        files = rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / f"{number}.npz")
+        files = rows.update(buffer.ring(), buffer.steps, tmp_path / f"{number}.npz")
         assert len(files) <= 5
         check(buffer, tmp_path, files)
 
@@ -96,7 +96,7 @@ def test_small_files_are_merged(tmp_path: Path) -> None:
 def test_what_steps_do_not_explain_is_written_anew(meddle: str, tmp_path: Path) -> None:
     buffer, rows = Buffer(), RowFiles()
     buffer.add(8)
-    rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / "1.npz")
+    rows.update(buffer.ring(), buffer.steps, tmp_path / "1.npz")
     if meddle == "reset":
         buffer.pos = 0
     elif meddle == "replaced":
@@ -104,7 +104,7 @@ def test_what_steps_do_not_explain_is_written_anew(meddle: str, tmp_path: Path) 
     else:
         buffer.add(1)
         buffer.steps -= 1
-    files = rows.update(buffer, buffer.ring(), buffer.steps, tmp_path / "2.npz")
+    files = rows.update(buffer.ring(), buffer.steps, tmp_path / "2.npz")
     read = {name: np.zeros_like(column) for name, column in buffer.columns.items()}
     fill(read, tmp_path, files)
     for name, column in buffer.columns.items():
