@@ -25,7 +25,6 @@ from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import (
     Check,
     by_name,
-    check_policy,
     check_settings,
     either,
     entropy_coefficient,
@@ -109,7 +108,11 @@ class OffPolicyFlow(OffPolicyAlgorithm):
     ) -> None:
         given = by_name(self.stock, args, kwargs)
         check_settings(given, self.settings)
-        check_policy(given.get("policy"), self.policy_class_of_stock, self.policy_aliases)
+        policy, kind, names = given.get("policy"), self.policy_class_of_stock, self.policy_aliases
+        if not (issubclass(policy, kind) if isinstance(policy, type) else policy in names):
+            raise ValueError(
+                f"policy must be one of {list(names)} or a {kind.__name__}, got {policy}"
+            )
         self.action_noise_color = action_noise_color
         self.action_noise_correlation_time = action_noise_correlation_time
         self._exploration = ColoredExploration()

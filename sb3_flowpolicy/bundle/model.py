@@ -167,7 +167,7 @@ def _parse(
         "learning_rate": training.rate_from_spec(config["settings"]["learning_rate"]),
         "normalization": normalization_from_spec(config["normalization"], space, arrays),
         **policy_from_spec(config["policy"]),
-        **training.buffer_from_spec(config["replay_buffer"], space),
+        **training.buffer_from_spec(config["replay_buffer"]),
     }
     for name, check in cls.settings.items():
         value = config["settings"][name]
@@ -185,16 +185,15 @@ def _check_content(
     config: dict[str, Any], arrays: Arrays, again: dict[str, Any], values: Arrays
 ) -> None:
     """Check that a model holds everything in the file, and nothing was converted or left out."""
-    for key in (config.keys() | again.keys()) - {"made_with"}:
-        found, expected = canonical(config.get(key)), canonical(again.get(key))
-        if found != expected:
-            raise ValueError(f"{key} must be as save_safe writes it, {expected}, got {found}")
-    if arrays.keys() != values.keys():
-        names = sorted(arrays.keys() ^ values.keys())
-        raise ValueError(f"arrays must be those of the model, got {names} missing or added")
-    for name, array in values.items():
-        if arrays[name].dtype != array.dtype or not np.array_equal(arrays[name], array):
-            raise ValueError(f"{name} must have the type and the values that the model keeps")
+    keys = sorted((config.keys() | again.keys()) - {"made_with"})
+    differing = [key for key in keys if canonical(config.get(key)) != canonical(again.get(key))]
+    differing += sorted(arrays.keys() ^ values.keys())
+    for name in arrays.keys() & values.keys():
+        found, expected = arrays[name], values[name]
+        if found.dtype != expected.dtype or not np.array_equal(found, expected):
+            differing.append(name)
+    if differing:
+        raise ValueError(f"{differing} must be as save_safe writes them")
 
 
 @contextmanager

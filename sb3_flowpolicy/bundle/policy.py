@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.common.validation import integer
+from sb3_flowpolicy.common.validation import integer, one_of
 
 
 def _by_name(*classes: type) -> dict[str, Any]:
@@ -58,10 +58,8 @@ def name_of(argument: str, value: Any) -> str:
 
 def class_of(argument: str, name: str) -> Any:
     """Return the class that :func:`name_of` named."""
-    known = _CLASSES[argument]
-    if name not in known:
-        raise ValueError(f"{argument} must be one of {list(known)}, got {name!r}")
-    return known[name]
+    one_of(*_CLASSES[argument])(argument, name)
+    return _CLASSES[argument][name]
 
 
 def policy_to_spec(model: SAC) -> dict[str, Any]:

@@ -50,8 +50,6 @@ def space_from_spec(name: str, spec: dict[str, Any], arrays: Arrays) -> spaces.S
         )
     if kind == "Box":
         low, high = arrays[f"{name}.low"], arrays[f"{name}.high"]
-        if not (low <= high).all():
-            raise ValueError(f"{name} must have low <= high, got {low} and {high}")
         return spaces.Box(low, high, dtype=low.dtype.type)
     if kind == "Discrete":
         return spaces.Discrete(_count(f"{name}.n", spec["n"]), start=spec["start"])

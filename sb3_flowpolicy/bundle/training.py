@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_flowpolicy.bundle.container import Arrays, tensor_like
@@ -134,9 +132,9 @@ def buffer_to_spec(model: SAC) -> dict[str, Any]:
     return {"class": name_of("replay_buffer_class", model.replay_buffer_class), "kwargs": kwargs}
 
 
-def buffer_from_spec(spec: dict[str, Any], space: spaces.Space) -> dict[str, Any]:
+def buffer_from_spec(spec: dict[str, Any]) -> dict[str, Any]:
     """Return the model's attributes that :func:`buffer_to_spec` described."""
-    kind = class_of("replay_buffer_class", spec["class"])
-    if issubclass(kind, DictReplayBuffer) != isinstance(space, spaces.Dict):
-        raise ValueError(f"replay_buffer_class must fit {space}, got {spec['class']}")
-    return {"replay_buffer_class": kind, "replay_buffer_kwargs": dict(spec["kwargs"])}
+    return {
+        "replay_buffer_class": class_of("replay_buffer_class", spec["class"]),
+        "replay_buffer_kwargs": dict(spec["kwargs"]),
+    }

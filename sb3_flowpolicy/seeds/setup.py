@@ -91,7 +91,6 @@ def make_vec_env(env: str | EnvFactory, count: int) -> VectorEnv:
 
 
 def make_progress_bar(total: int) -> Any:
-    """Return the progress bar that SB3 uses; raise ``ImportError`` if it is not installed."""
-    if callbacks.tqdm is None:
-        raise ImportError('the progress bar needs tqdm and rich: pip install "sb3_flowpolicy[zoo]"')
+    """Return the progress bar that SB3 uses."""
+    callbacks.ProgressBarCallback()  # raises ImportError if it is not installed
     return callbacks.tqdm(total=total)

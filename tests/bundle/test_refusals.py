@@ -40,8 +40,8 @@ def array(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
 WEIGHT = "policy.actor.latent_pi.0.weight"
 REFUSED: dict[str, tuple[Change, str]] = {
     "later version": (setting("format", 2), r"format must be 1, got 2: is it a newer file"),
-    "unknown key": (setting("extra", 1), "extra must be as save_safe writes it, null, got 1"),
-    "unknown setting": (setting("settings.x", 1), "settings must be as save_safe writes it"),
+    "unknown key": (setting("extra", 1), "extra.* must be as save_safe writes"),
+    "unknown setting": (setting("settings.x", 1), "settings.* must be as save_safe writes"),
     "missing key": (lambda c, a: c["settings"].pop("tau"), "KeyError: 'tau'"),
     "no object": (setting("progress", 3), "TypeError: 'int' object is not subscriptable"),
     "class by path": (setting("policy.policy_class", "os.system"), r"one of .* got 'os\.system'"),
@@ -70,7 +70,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     ),
     "bounds": (
         array("action_space.low", lambda low: low + 9),
-        "action_space must have low <= high",
+        "less than or equal to high",
     ),
     "infinite actions": (
         array("action_space.high", lambda high: high * np.inf),
@@ -80,7 +80,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "type": (array(WEIGHT, lambda weight: weight.astype("f8")), rf"{WEIGHT} must be torch.float32"),
     "NaN": (array(WEIGHT, lambda weight: weight * np.nan), rf"NaN or infinity in {WEIGHT}"),
     "missing array": (lambda c, a: a.pop(WEIGHT), rf"KeyError: '{WEIGHT}'"),
-    "unknown array": (lambda c, a: a.update(x=np.ones(3)), r"got \['x'\] missing or added"),
+    "unknown array": (lambda c, a: a.update(x=np.ones(3)), r"\['x'\] must be as save_safe writes"),
     "schedule": (setting("settings.learning_rate", {"schedule": "code"}), "learning_rate must be"),
     "rate": (setting("settings.learning_rate", -1.0), "learning_rate must be at least 0, got -1"),
     "setting": (setting("settings.gamma", "high"), "gamma must be a number, got 'high'"),
@@ -88,15 +88,11 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "undecided": (setting("settings.target_entropy", "auto"), "target_entropy must be a number"),
     "progress": (setting("progress.num_timesteps", -1), "num_timesteps must be an integer"),
     "buffer": (setting("replay_buffer.class", "dict"), "replay_buffer_class must be one of"),
-    "unfit buffer": (
-        setting("replay_buffer.class", "HerReplayBuffer"),
-        "replay_buffer_class must fit",
-    ),
     "betas": (setting("optimizers.actor.betas", [0.9, 1.5]), "Invalid beta parameter at index 1"),
     "number of betas": (setting("optimizers.actor.betas", [0.9] * 3), "too many values to unpack"),
     "type of betas": (setting("optimizers.actor.betas", ["0.9", 0.9]), "betas must be a number"),
     "optimizer": (lambda c, a: c["optimizers"].pop("actor"), "KeyError: 'actor'"),
-    "optimizer's setting": (setting("optimizers.actor.x", 1), "optimizers must be as save_safe"),
+    "optimizer's setting": (setting("optimizers.actor.x", 1), "optimizers.* must be as save_safe"),
     "moments": (
         array("optimizer.actor.0.exp_avg_sq", lambda square: square - 1),
         "exp_avg_sq must be at least 0",
@@ -153,7 +149,7 @@ def test_messages_about_damaged_files(bundle: Path, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match=rf"a header of .* bytes, more than {MAX_HEADER_BYTES}"):
         SACFlow.load_safe(path)
     safetensors.numpy.save_file({"x": np.ones(3)}, path, {"format": "np"})
-    with pytest.raises(BundleError, match=r"a safetensors file with the metadata \['format'\]"):
+    with pytest.raises(BundleError, match="KeyError: 'sb3_flowpolicy'"):
         SACFlow.load_safe(path)
 
 
