@@ -48,7 +48,7 @@ def test_names_are_not_stolen() -> None:
         register_distribution("realnvp", Mine)
 
 
-@pytest.mark.parametrize(("name", "density"), [("mine", int), (5, Mine), ("mine", Mine(2, 3))])
-def test_only_densities_are_registered(name: Any, density: Any) -> None:
+@pytest.mark.parametrize(("name", "kind"), [("mine", int), (5, Mine), ("mine", Mine(2, 3))])
+def test_only_densities_are_registered(name: Any, kind: Any) -> None:
     with pytest.raises(TypeError):
-        register_distribution(name, density)
+        register_distribution(name, kind)
