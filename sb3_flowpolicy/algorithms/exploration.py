@@ -40,10 +40,7 @@ class ColoredExploration:
     def fit(self, agent: OffPolicyAlgorithm, n_envs: int, env: Any) -> None:
         """Adopt the agent's present settings; a process that already has them continues.
 
-        Args:
-            agent: The agent.
-            n_envs: Number of environments.
-            env: The environment, for the length of its episodes.
+        The environment, if it is known, tells how long episodes are.
 
         Raises:
             ValueError: If settings are out of range, or the policy has no density of ours.

@@ -83,11 +83,7 @@ class NoiseProcess:
         return (self._weights * self._values).sum(1).to(white.dtype)
 
     def restart(self, ended: np.ndarray | None = None) -> None:
-        """Forget the past of environments whose episode ended.
-
-        Args:
-            ended: Which, boolean of shape (N,). Default: all.
-        """
+        """Forget the past where an episode ended, boolean (N,); default: everywhere."""
         self._starting |= True if ended is None else th.as_tensor(ended).view(-1, 1, 1)
 
     def state(self) -> dict[str, th.Tensor]:

@@ -53,10 +53,7 @@ def _origin(layer: Any) -> str:
 def layer_states(env: Any, outside_only: bool = False) -> LayerStates:
     """Collect what steps may change in every layer, without copying.
 
-    Args:
-        env: The environment.
-        outside_only: Collect only SB3's wrappers around vectorized environments, such as
-            ``VecNormalize``: what is inside may be impossible to pickle.
+    ``outside_only`` omits what is inside of SB3's wrappers, which may be impossible to pickle.
     """
     return {
         name: {key: value for key, value in vars(layer).items() if key not in _NOT_STATE}

@@ -37,15 +37,7 @@ def is_data(value: Any) -> bool:
 
 
 def dumps(value: Any, known: Mapping[str, object]) -> bytes:
-    """Pickle ``value``; objects in ``known`` are stored by name, without their contents.
-
-    Args:
-        value: What to pickle.
-        known: Name -> object that :func:`loads` will be given another one for.
-
-    Raises:
-        Exception: Of any kind, if something cannot be pickled.
-    """
+    """Pickle ``value``; objects in ``known`` are stored by name, without their contents."""
     file = io.BytesIO()
     _Pickler(file, {id(thing): name for name, thing in known.items()}).dump(value)
     return file.getvalue()

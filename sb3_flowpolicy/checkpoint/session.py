@@ -99,9 +99,6 @@ class RunCheckpoints:
         """Begin to write checkpoints, until :meth:`stop`.
 
         The first checkpoint of a new run is due at once, to report early what cannot be saved.
-
-        Raises:
-            ValueError: As :meth:`learning`.
         """
         integer(1)("checkpoint_every", every)
         path = Path(path)
@@ -135,12 +132,7 @@ class RunCheckpoints:
         self._signals.release()
 
     def remaining(self, total_timesteps: int, reset_num_timesteps: bool) -> tuple[int, bool]:
-        """Return the arguments with which an interrupted call of ``learn`` goes on to its end.
-
-        Args:
-            total_timesteps: Argument of the call.
-            reset_num_timesteps: Argument of the call.
-        """
+        """Return the arguments with which an interrupted call of ``learn`` goes on to its end."""
         if not self.resuming:
             return total_timesteps, reset_num_timesteps
         end = total_timesteps + (0 if reset_num_timesteps else self._begun)

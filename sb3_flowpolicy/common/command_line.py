@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from sb3_flowpolicy.common.validation import integer
 
 
@@ -32,11 +34,7 @@ def at_least(least: int) -> Callable[[str], int]:
 
     def convert(text: str) -> int:
         try:
-            value: Any = int(text)
-        except ValueError:
-            value = text
-        try:
-            return integer(least)("value", value)
+            return integer(least)("value", int(text))
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 
@@ -53,5 +51,5 @@ def run(main: Callable[[], Any]) -> None:
     """Run a command; say in one line what went wrong, without a traceback."""
     try:
         main()
-    except (ValueError, AssertionError, OSError) as error:  # rl_zoo3 asserts
+    except (ValueError, AssertionError, OSError, gym.error.Error) as error:  # rl_zoo3 asserts
         sys.exit(f"error: {error}")

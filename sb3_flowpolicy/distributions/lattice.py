@@ -26,7 +26,8 @@ class SoftLogStdHead(nn.Linear):
 
     def forward(self, context: th.Tensor) -> th.Tensor:
         """Return the bounded log standard deviations, shape (..., outputs)."""
-        return _bounded(super().forward(context))
+        log_std = super().forward(context)
+        return soft_bound(log_std, th.where(log_std > 0, LOG_STD_MAX, -LOG_STD_MIN))
 
 
 class Lattice(DiagGaussian):
@@ -111,11 +112,6 @@ class Lattice(DiagGaussian):
     def _entropy(self, context: th.Tensor) -> th.Tensor | None:
         half_log_det = _half_log_det(self.scale_tril(context, self.log_std(context)))
         return half_log_det.to(context) + self.action_dim * STANDARD_NORMAL_ENTROPY
-
-
-def _bounded(log_std: th.Tensor) -> th.Tensor:
-    """Squeeze into (LOG_STD_MIN, LOG_STD_MAX), with slope 1 at zero."""
-    return soft_bound(log_std, th.where(log_std > 0, LOG_STD_MAX, -LOG_STD_MIN))
 
 
 def _half_log_det(lower: th.Tensor) -> th.Tensor:

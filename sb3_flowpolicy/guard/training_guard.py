@@ -59,11 +59,7 @@ class TrainingGuard:
         self.restart()
 
     def restart(self, resume_from: str | Path | None = None) -> None:
-        """Discard the copies, when learning begins.
-
-        Args:
-            resume_from: Folder of the checkpoints that are being written, to be named in messages.
-        """
+        """Discard the copies, when learning begins; messages name the folder of checkpoints."""
         self.resume_from = resume_from
         self._kept: list[_Snapshot] = []
         self._kept_at, self._due = 0, -1
@@ -85,11 +81,7 @@ class TrainingGuard:
         return found
 
     def before_updates(self) -> None:
-        """Check and copy everything, if that is due.
-
-        Raises:
-            NonFiniteError: If any of it is not finite.
-        """
+        """Check and copy everything, if that is due, as :meth:`look` does."""
         done = self.models[0]._n_updates
         if done >= self._due:
             self._kept = self.look()

@@ -29,8 +29,6 @@ from sb3_flowpolicy.policies.sb3_distribution import (
     estimate_entropy,
 )
 
-# Arguments of SB3's gSDE, which is not built.
-_UNUSED = {"use_sde", "full_std", "use_expln", "squash_output"}
 # Bound on the gradient of the loss with respect to a log-probability, which in PPO is advantage
 # times ratio. A larger gradient only says that the policy has left the actions it is judged by.
 _LARGEST_GRADIENT = 1e6
@@ -65,7 +63,7 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
 
     Raises:
         ValueError: If the action space is not a Box (with finite bounds), the density is unknown,
-            or an argument belongs to SB3's gSDE (``use_sde=True``, ``full_std``, ...).
+            or ``use_sde=True``.
 
     References:
         Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5, which
@@ -89,12 +87,8 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         **policy_kwargs: Any,
     ) -> None:
         check_action_space(action_space, bounded=squash_output)
-        unused = sorted(policy_kwargs.keys() & _UNUSED)
-        if use_sde or unused:
-            raise ValueError(
-                "use_sde must be False and policy_kwargs must not have arguments of SB3's gSDE, "
-                f"which the density replaces, got use_sde={use_sde} and {unused}"
-            )
+        if use_sde:
+            raise ValueError("use_sde must be False, because the density replaces gSDE, got True")
         net_arch = policy_kwargs.get("net_arch")
         if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], Mapping):
             net_arch = net_arch[0]  # the form before SB3 1.8, which SB3 accepts with a warning
@@ -199,10 +193,8 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         return self.action_dist.proba_distribution(latent_pi)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        used = {name: value for name, value in data.items() if name not in _UNUSED}
         return {
-            **used,
+            **super()._get_constructor_parameters(),
             "squash_output": self._squashes,
             "state_dependent_std": self.state_dependent_std,
         }

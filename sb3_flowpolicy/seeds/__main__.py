@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
@@ -148,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--algo", default="sac_flow", help="sac_flow, sac_lowrank or sac_gauss")
-    add("--env", default="TunnelDiagonal-v0", help="environment id", type=_known_env)
+    add("--env", default="TunnelDiagonal-v0", help="environment id")
     add("--seeds", type=at_least(1), default=10, help="number of seeds")
     add(
         "--first-seed",
@@ -171,14 +170,6 @@ def _parser() -> argparse.ArgumentParser:
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--resume", action="store_true", help=_RESUME_HELP)
     return parser
-
-
-def _known_env(env_id: str) -> str:
-    try:
-        gym.spec(env_id)
-    except gym.error.Error as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-    return env_id
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -70,10 +71,9 @@ def test_an_interrupted_run_ends_with_the_same_agents_and_evaluations(
         )
 
 
-def test_wrong_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--env", "NoTunnel-v0"])
-    assert "NoTunnel" in capsys.readouterr().err
+def test_wrong_arguments(tmp_path: Path) -> None:
+    with pytest.raises(gym.error.Error, match="NoTunnel"):
+        main(["--env", "NoTunnel-v0", "-f", str(tmp_path)])
     with pytest.raises(ValueError, match=r"algo must be one of .*'sac_flow'.*got 'ppo'"):
         main(["--algo", "ppo", "-f", str(tmp_path)])
     with pytest.raises(ValueError, match=r"hyperparams must be .*, got 'gamma'"):
