@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -24,7 +25,6 @@ from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_c
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import (
     Check,
-    by_name,
     check_settings,
     either,
     entropy_coefficient,
@@ -106,7 +106,8 @@ class OffPolicyFlow(OffPolicyAlgorithm):
         action_noise_correlation_time: float | None = None,
         **kwargs: Any,
     ) -> None:
-        given = by_name(self.stock, args, kwargs)
+        names_of_args = inspect.signature(self.stock).parameters
+        given = {**dict(zip(names_of_args, args, strict=False)), **kwargs}
         check_settings(given, self.settings)
         policy, kind, names = given.get("policy"), self.policy_class_of_stock, self.policy_aliases
         if not (issubclass(policy, kind) if isinstance(policy, type) else policy in names):

@@ -259,10 +259,7 @@ def load_agent(
     """
     check_same_build(env, checkpoint.manifest["layers"][name])
     path = checkpoint.folder / f"{name}.zip"
-    try:
-        return algorithm.load(path, env=env, device=device, force_reset=False)
-    except ValueError as error:
-        raise ValueError(f"env must be that of {checkpoint.folder}: {error}") from error
+    return algorithm.load(path, env=env, device=device, force_reset=False)
 
 
 def _facts(run: Run) -> dict[str, Any]:

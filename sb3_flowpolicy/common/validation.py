@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -169,14 +168,3 @@ def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check]) -> N
     for name, check in {**table, **_FURTHER}.items():
         if name in settings:
             check(name, settings[name])
-
-
-def by_name(algorithm: type, args: Iterable[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the positional and keyword arguments of a constructor by name.
-
-    Example:
-        >>> from stable_baselines3 import SAC
-        >>> by_name(SAC, ["MlpPolicy", "Pendulum-v1"], {"gamma": 0.9})
-        {'policy': 'MlpPolicy', 'env': 'Pendulum-v1', 'gamma': 0.9}
-    """
-    return {**dict(zip(inspect.signature(algorithm).parameters, args, strict=False)), **kwargs}

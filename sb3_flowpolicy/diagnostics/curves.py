@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_flowpolicy.diagnostics.figures import draw_seeds, new_figure
+from sb3_flowpolicy.diagnostics.figures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,9 @@ def curves_figure(files: Mapping[str, str | Path]) -> Figure:
     for k, (name, file) in enumerate(files.items()):
         rows = np.genfromtxt(file, delimiter=",", names=True)
         returns = [rows["test_return"][rows["seed"] == seed] for seed in np.unique(rows["seed"])]
-        draw_seeds(axes, np.unique(rows["step"]), returns, f"C{k}", name)
+        steps = np.unique(rows["step"])
+        axes.plot(steps, np.transpose(returns), color=f"C{k}", linewidth=0.8, alpha=0.4)
+        axes.plot(steps, np.mean(returns, 0), color=f"C{k}", linewidth=2.2, label=name)
     axes.set(xlabel="environment steps", ylabel="test return")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike
 
 POLICY_BLUE = "#1f6fb4"
 
@@ -19,13 +17,6 @@ def new_figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
-
-
-def draw_seeds(axes: Axes, steps: ArrayLike, values: ArrayLike, color: str, label: str) -> None:
-    """Draw each seed of ``values`` (S, T) as a thin line and their mean as a thick one."""
-    values = np.asarray(values)
-    axes.plot(steps, values.T, color=color, linewidth=0.8, alpha=0.4)
-    axes.plot(steps, values.mean(0), color=color, linewidth=2.2, label=label)
 
 
 def correlation_figure(correlation: np.ndarray) -> Figure:

@@ -62,15 +62,7 @@ class Batch(NamedTuple):
 
     def of(self, seeds: slice) -> Batch:
         """Return some seeds' part, as views."""
-        return Batch(
-            self.obs[seeds],
-            self.actions[seeds],
-            self.next_obs[seeds],
-            self.dones[seeds],
-            self.rewards[seeds],
-            self.discounts[seeds],
-            self.noise[:, seeds],
-        )
+        return Batch._make([*(column[seeds] for column in self[:-1]), self.noise[:, seeds]])
 
     def columns(self, seed: int) -> dict[str, np.ndarray]:
         """Return one seed's observations, actions, rewards and next observations, (B, ...)."""
