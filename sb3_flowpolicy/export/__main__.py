@@ -96,8 +96,6 @@ def find_statistics(model: Path) -> Path | None:
 
 
 def _load_model(path: Path) -> SACFlow:
-    if not path.is_file():
-        raise ValueError(f"MODEL must be an existing file, got {str(path)!r}")
     if not zipfile.is_zipfile(path):
         return SACFlow.load_safe(path, device="cpu")
     no_buffer: Any = object()

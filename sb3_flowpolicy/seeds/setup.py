@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.engine import why_unsupported
+from sb3_flowpolicy.engine.replay import is_plain
 
 EnvFactory = Callable[[], gym.Env]
 CallbackFactory = Callable[[int], BaseCallback]
@@ -50,27 +51,29 @@ def copy_callback(
 
 def check_stackable(model: SACFlow) -> None:
     """Raise ``ValueError`` if agents like this one cannot be trained in lockstep."""
-    reason = why_unsupported(model)
-    if reason is None and is_image_space(model.observation_space):
-        reason = "image observations"
+    reason, frequency, buffer = why_unsupported(model), model.train_freq, model.replay_buffer
+    assert isinstance(frequency, TrainFreq)
+    assert buffer is not None
     if reason is not None:
         refuse(reason)
-    assert isinstance(model.train_freq, TrainFreq)
-    if model.train_freq.unit is not TrainFrequencyUnit.STEP or model.gradient_steps < 0:
-        raise ValueError(
-            "train_freq must count steps and gradient_steps be at least 0 for seeds to stay in "
-            f"step, got {model.train_freq} and {model.gradient_steps}"
-        )
-    if model.action_noise is not None or model.device.type != "cpu":
-        raise ValueError(
-            "agents must collect on the CPU and without action_noise, got "
-            f"device {model.device} and action_noise {model.action_noise}"
-        )
+    if is_image_space(model.observation_space):
+        refuse("image observations")
+    if frequency.unit is not TrainFrequencyUnit.STEP or model.gradient_steps < 0:
+        refuse(f"train_freq {frequency} with gradient_steps {model.gradient_steps}")
+    if model.action_noise is not None:
+        refuse(f"action_noise {model.action_noise}")
+    if model.device.type != "cpu":
+        refuse(f"device {model.device}")
+    if not is_plain(buffer):
+        refuse(f"{type(buffer).__name__}, {buffer.optimize_memory_usage=}")
 
 
 def refuse(reason: str) -> None:
-    """Raise ``ValueError`` with the reason why the engine cannot stack agents."""
-    raise ValueError(f"agents must be of a kind the engine can stack, got {reason}")
+    """Raise ``ValueError`` with the reason why agents cannot be stacked."""
+    raise ValueError(
+        "agents must act and learn in lockstep, on the CPU, with plain replay buffers and a fixed "
+        f"number of updates per step, got {reason}"
+    )
 
 
 def make_env(env: str | EnvFactory) -> gym.Env:

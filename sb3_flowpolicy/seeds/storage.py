@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_flowpolicy.engine.replay import ReplayRows, is_plain
+from sb3_flowpolicy.engine.replay import ReplayRows
 from sb3_flowpolicy.engine.update import Batch
 
 # Random numbers are drawn for this many updates or steps at once, as each call has a fixed cost.
@@ -24,16 +24,10 @@ class SeedStorage:
         buffers: One buffer per seed, equally filled: plain SB3 buffers of one environment.
 
     Raises:
-        ValueError: If a buffer is of another kind, or they are filled differently.
+        ValueError: If they are filled differently.
     """
 
     def __init__(self, buffers: Sequence[ReplayBuffer]) -> None:
-        for buffer in buffers:
-            if not is_plain(buffer):
-                raise ValueError(
-                    f"replay buffers must be plain ReplayBuffers, got {type(buffer).__name__} with "
-                    f"optimize_memory_usage={buffer.optimize_memory_usage}"
-                )
         self.buffers = list(buffers)
         self.check_equally_filled()
         self.rows = ReplayRows(buffers)

@@ -81,7 +81,7 @@ def test_where_statistics_are_looked_for(tmp_path: Path) -> None:
     [
         (
             ["safe", "nowhere.zip"],
-            "MODEL must be an existing file, got 'nowhere.zip'",
+            "nowhere.zip must be a bundle written by save_safe: not a regular file that exists",
         ),
         (["safe", "text.zip"], "text.zip must be a bundle written by save_safe: a header of"),
         (["onnx", "empty.zip"], "empty.zip must be a model that SACFlow or SAC saved, got "),
