@@ -90,7 +90,7 @@ def load_bundle(
         env = _wrapped(cls, env, attributes)
         attributes["normalization"] = None  # from now on the environment's
     with _refusing(path):
-        model = cls(attributes["policy_class"], env, device=device, _init_setup_model=False)
+        model: Any = cls(attributes["policy_class"], env, device=device, _init_setup_model=False)
         model.__dict__.update(attributes)
         if env is None:
             model.n_envs = 1
@@ -103,7 +103,7 @@ def load_bundle(
         name, ent_coef = _ent_coef(model)
         with th.no_grad():
             ent_coef.copy_(tensor_like(ent_coef, name, arrays))
-        for name, optimizer in _optimizers(model).items():
+        for name, optimizer in model.optimizers().items():
             training.load_optimizer(
                 f"optimizer.{name}", optimizer, config["optimizers"][name], arrays
             )
@@ -142,7 +142,7 @@ def _describe(model: Any, normalization: Normalization | None) -> tuple[dict[str
         "progress": {name: check(name, getattr(model, name)) for name, check in _PROGRESS.items()},
         "optimizers": {
             name: training.optimizer_to_spec(f"optimizer.{name}", optimizer, arrays)
-            for name, optimizer in _optimizers(model).items()
+            for name, optimizer in model.optimizers().items()
         },
         "normalization": normalization_to_spec(normalization, arrays),
     }
@@ -230,13 +230,6 @@ def _ent_coef(model: SAC) -> tuple[str, th.Tensor]:
     if model.log_ent_coef is None:
         return "ent_coef_tensor", model.ent_coef_tensor
     return "log_ent_coef", model.log_ent_coef
-
-
-def _optimizers(model: SAC) -> dict[str, th.optim.Optimizer]:
-    found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
-    if model.ent_coef_optimizer is not None:
-        found["ent_coef"] = model.ent_coef_optimizer
-    return found
 
 
 def _with_suffix(path: Path) -> Path:

@@ -6,7 +6,7 @@ import inspect
 import random
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -226,16 +226,13 @@ def _callback_state(callback: BaseCallback) -> dict[str, Any]:
 
     Attributes named like arguments of its constructor are settings and may change: left out.
     """
-    settings = {name for kind in type(callback).__mro__ for name in _arguments(kind)}
+    constructors = [kind.__init__ for kind in type(callback).__mro__]  # type: ignore[misc]
+    settings = {name for one in constructors for name in inspect.signature(one).parameters}
     return {
         key: value
         for key, value in vars(callback).items()
         if key not in settings and pickling.is_data(value)
     }
-
-
-def _arguments(kind: type) -> Iterable[str]:
-    return inspect.signature(kind.__init__).parameters  # type: ignore[misc]
 
 
 def _tree(root: BaseCallback) -> Iterator[BaseCallback]:
