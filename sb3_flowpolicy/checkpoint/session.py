@@ -114,11 +114,12 @@ class RunCheckpoints:
                 self._last = self._run().first.num_timesteps
             else:
                 store = CheckpointStore(path)
-                if path.is_file() or store.folders():
-                    found = f"which holds {store.folders()[-1].name}: resume that run, or choose"
+                folders = store.folders()
+                if folders or path.is_file():
+                    content = f"has {folders[-1].name}" if folders else "is a file"
                     raise ValueError(
-                        f"checkpoint_path must be an empty folder for a new run, got {path}, "
-                        + ("a file" if path.is_file() else f"{found} another folder")
+                        f"checkpoint_path must be an empty folder for a new run, got {path}, which "
+                        f"{content}: resume that run, or choose another folder"
                     )
                 self._store, self._rows, self._last = store, RowFiles(), None
                 self._resumed_from = None

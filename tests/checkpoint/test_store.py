@@ -156,7 +156,7 @@ def test_a_tunnel_of_another_width_is_another_environment(run: Path) -> None:
 
 def test_the_folder_must_be_a_path_to_a_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match=r"must be an empty folder .*file, a file"):
+    with pytest.raises(ValueError, match=r"must be an empty folder .*file, which is a file"):
         SACFlow("FlowPolicy", ENV, **FAST).learn(
             20, checkpoint_every=10, checkpoint_path=tmp_path / "file"
         )
