@@ -63,17 +63,16 @@ class FlatAdam:
         self.step = th.zeros(len(data), n_owners, device=data.device)
         self._bound = []
         for seed, optimizer in enumerate(self.optimizers):
+            entries = []
             pairs = self.flat.views(self.mean, seed), self.flat.views(self.square, seed)
             for step, (owner, mean), (_, square) in zip(self.step[seed], *pairs, strict=True):
+                entries.append((owner, mean, square))
                 state = optimizer.state[owner]
                 if state:
                     step.copy_(state["step"])
                     mean.copy_(state["exp_avg"])
                     square.copy_(state["exp_avg_sq"])
                 state.update(step=step, exp_avg=mean, exp_avg_sq=square)
-            entries = [
-                (owner, mean, square) for (owner, mean), (_, square) in zip(*pairs, strict=True)
-            ]
             self._bound.append((optimizer, optimizer.state, entries))
 
     def is_bound(self) -> bool:
