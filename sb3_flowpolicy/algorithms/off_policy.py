@@ -112,7 +112,7 @@ class OffPolicyFlow(OffPolicyAlgorithm):
         policy, kind, names = given.get("policy"), self.policy_class_of_stock, self.policy_aliases
         if not (issubclass(policy, kind) if isinstance(policy, type) else policy in names):
             raise ValueError(
-                f"policy must be one of {list(names)} or a {kind.__name__}, got {policy}"
+                f"policy must be one of {list(names)} or a {kind.__name__}, got {policy!r}"
             )
         self.action_noise_color = action_noise_color
         self.action_noise_correlation_time = action_noise_correlation_time

@@ -136,7 +136,7 @@ def test_loaded_model_needs_no_demonstrations(tmp_path: Path) -> None:
         ({"critic_loss_coef": float("nan")}, "critic_loss_coef must be finite, got nan"),
         ({"demonstrations": "nowhere.npz"}, "got 'nowhere.npz' .*No such file"),
         ({"demonstrations": {"actions": np.zeros(3)}}, r"KeyError: 'observations'"),
-        ({"policy": "NoPolicy"}, "policy must be one of .* got NoPolicy"),
+        ({"policy": "NoPolicy"}, "policy must be one of .* got 'NoPolicy'"),
         ({"policy_kwargs": {"distribution": "nvp"}}, "distribution must be one of"),
     ],
 )
