@@ -9,7 +9,7 @@ import torch as th
 from torch.distributions import MultivariateNormal, Normal
 
 from sb3_flowpolicy.distributions import Lattice
-from sb3_flowpolicy.distributions.lattice import LOG_STD_MAX, LOG_STD_MIN, _bounded
+from sb3_flowpolicy.distributions.lattice import LOG_STD_MAX, LOG_STD_MIN, SoftLogStdHead
 from tests.distributions.conftest import CONTEXT_DIM, DIMS, build
 
 
@@ -113,7 +113,11 @@ def test_float32_agrees_with_float64_on_large_covariances() -> None:
 
 def test_bounds_are_soft() -> None:
     value = th.tensor([-1e3, 0.0, 1e3], requires_grad=True)
-    bounded = _bounded(value)
+    head = SoftLogStdHead(1, 1)
+    with th.no_grad():
+        head.weight.fill_(1.0)
+        head.bias.zero_()
+    bounded = head(value.unsqueeze(-1)).squeeze(-1)
     bounded.sum().backward()
     assert LOG_STD_MIN < bounded[0] < LOG_STD_MIN + 0.2
     assert LOG_STD_MAX - 0.01 < bounded[2] < LOG_STD_MAX
