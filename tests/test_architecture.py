@@ -30,7 +30,7 @@ RESEARCH = ["density", "benchmarks", "experiments"]
 FLOORS = LIBRARY + RESEARCH
 THIRD_PARTY = {
     "distributions": {"torch"},
-    "density": {"torch", "numpy", "scipy", "sklearn", "matplotlib", "PIL", "tqdm"},
+    "density": {"torch", "numpy", "pandas", "scipy", "sklearn", "matplotlib", "PIL", "tqdm"},
     "policies": {"torch", "numpy", "gymnasium", "stable_baselines3", "sb3_contrib"},
 }
 

@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+from sb3_flowpolicy.common.command_line import at_least
+
 EPILOG = """examples:
   python -m sb3_flowpolicy.density list
   python -m sb3_flowpolicy.density run two-moons-label          one study, ten seeds
@@ -31,10 +33,10 @@ def main(arguments: list[str] | None = None) -> None:
     run = actions.add_parser("run", help="fit, measure and draw; tables and pictures go to --out")
     add = run.add_argument
     add("names", nargs="*", metavar="NAME", help="studies (default: all)")
-    add("--seeds", type=int, default=10, help="number of seeds (default: 10)")
-    add("--first-seed", type=int, default=0, help="first seed (default: 0)")
+    add("--seeds", type=at_least(1), default=10, help="number of seeds (default: 10)")
+    add("--first-seed", type=at_least(0), default=0, help="first seed (default: 0)")
     add("--quick", action="store_true", help="two seeds, hardly trained, within a minute")
-    add("--jobs", type=int, default=1, help="models fitted at the same time (default: 1)")
+    add("--jobs", type=at_least(1), default=1, help="models fitted at the same time (default: 1)")
     report = actions.add_parser("report", help="write README.md next to the results, and print it")
     for sub in (run, report):
         folder = f"folder of the results (default: {DEFAULT_FOLDER})"

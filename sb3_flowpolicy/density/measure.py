@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch as th
+from scipy.stats import sem
 
 from sb3_flowpolicy.density.datasets import AngleMoons, Sample, Scaler
-from sb3_flowpolicy.density.fit import Curves, Data, Ensemble, fit, mean_nll
+from sb3_flowpolicy.density.fit import Data, Ensemble, fit, mean_nll
 from sb3_flowpolicy.density.models import FlowModel
 from sb3_flowpolicy.density.studies import STUDIES, Scale, angles_to_score
 
-Row = dict[str, Any]
 # Added to a seed for each of its samples.
 VALIDATION_SEED, HELDOUT_SEED, ANGLE_SEED = 100_000, 200_000, 300_000
 # The integration grid is dense near the data and sparse beyond: x = sinh(u), up to +-74.
@@ -26,20 +25,20 @@ CHUNK = 80_000
 
 @dataclass(frozen=True)
 class Fitted:
-    """A trained ensemble, the scalers of its seeds' points, its curves and its scores."""
+    """A trained ensemble, the scalers of its seeds' points, and the tables of its scores."""
 
     model: str
     ensemble: Ensemble
     scalers: list[Scaler]
-    curves: Curves
-    rows: list[Row]  # one per seed, for fits.csv
-    angle_rows: list[Row]  # one per seed and angle, for angles.csv; empty for other studies
+    fits: pd.DataFrame  # one row per seed
+    curves: pd.DataFrame  # one row per seed and check during training
+    angles: pd.DataFrame  # one row per seed and angle; empty for other studies
 
     @property
     def middle(self) -> int:
         """Index of the seed with the median likelihood, which the pictures show."""
-        order = sorted(range(len(self.rows)), key=lambda i: self.rows[i]["nll"])
-        return order[(len(order) - 1) // 2]
+        order = np.argsort(self.fits["nll"].to_numpy(), kind="stable")
+        return int(order[(len(order) - 1) // 2])
 
     def middle_model(self) -> FlowModel:
         """Return the model of that seed."""
@@ -59,37 +58,46 @@ def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Sc
     train_data, held = as_data(train, scalers), as_data(heldout, scalers)
     epochs = max(2, study.epochs[model] // scale.shrink)
     curves = fit(ensemble, train_data, as_data(validation, scalers), epochs, seed=min(seeds))
-    train_nll = mean_nll(ensemble, train_data)
+    log_p = np.stack([data.log_density(sample) for sample in heldout])
     with th.no_grad():
         log_q = ensemble.log_prob(held.points, held.condition).double().numpy()
-    entropy = data.entropy()
-    accuracy = _accuracy(ensemble, held) if study_name == "two-moons-label" else None
+    # Of the standardized points, as the model sees them.
+    log_volume = np.array([scaler.log_volume for scaler in scalers])
+    gap = log_p + log_volume[:, None] - log_q
     conditions = th.from_numpy(study.conditions(scale)).float()
-    rows = []
-    for i, seed in enumerate(seeds):
-        # The true density of the standardized points.
-        log_p = data.log_density(heldout[i]) + scalers[i].log_volume
-        gap = log_p - log_q[i]
-        integrals = [integral(ensemble.member(i), one, scale.cells) for one in conditions]
-        rows.append(
-            {
-                "study": study_name,
-                "model": model,
-                "seed": seed,
-                "best_epoch": int(curves.best_epoch[i]),
-                "train_nll": float(train_nll[i]),
-                "nll": float(-log_q[i].mean()),
-                "nll_se": _standard_error(log_q[i]),
-                "entropy": entropy - scalers[i].log_volume,
-                "gap": float(gap.mean()),
-                "gap_se": _standard_error(gap),
-                "integral_low": min(integrals),
-                "integral_high": max(integrals),
-                "accuracy": "" if accuracy is None else float(accuracy[i]),
-            }
-        )
-    angle_rows = _angle_rows(ensemble, scale) if study_name == "angle-moons" else []
-    return Fitted(model, ensemble, scalers, curves, rows, angle_rows)
+    integrals = [
+        [integral(ensemble.member(i), one, scale.cells) for one in conditions]
+        for i in range(len(seeds))
+    ]
+    fits = pd.DataFrame(
+        {
+            "study": study_name,
+            "model": model,
+            "seed": list(seeds),
+            "best_epoch": curves.best_epoch.numpy(),
+            "train_nll": mean_nll(ensemble, train_data).double().numpy(),
+            "nll": -log_q.mean(1),
+            "nll_se": sem(log_q, axis=1),
+            "entropy": data.entropy() - log_volume,
+            "gap": gap.mean(1),
+            "gap_se": sem(gap, axis=1),
+            "integral_low": np.min(integrals, axis=1),
+            "integral_high": np.max(integrals, axis=1),
+            "accuracy": _accuracy(ensemble, held) if study_name == "two-moons-label" else None,
+        }
+    )
+    n_checks = len(curves.epoch)
+    progress = pd.DataFrame(
+        {
+            "model": model,
+            "seed": np.repeat(seeds, n_checks),
+            "epoch": np.tile(curves.epoch, len(seeds)),
+            "train": curves.train.double().T.flatten(),
+            "other": curves.validation.double().T.flatten(),
+        }
+    )
+    angles = _angles(ensemble, scale) if study_name == "angle-moons" else pd.DataFrame()
+    return Fitted(model, ensemble, scalers, fits, progress, angles)
 
 
 def as_data(samples: Sequence[Sample], scalers: Sequence[Scaler]) -> Data:
@@ -108,10 +116,10 @@ def label_posterior(
     return th.sigmoid(log_prob(points, label + 1) - log_prob(points, label))
 
 
-def _accuracy(ensemble: Ensemble, held: Data) -> th.Tensor:
+def _accuracy(ensemble: Ensemble, held: Data) -> np.ndarray:
     """Return each seed's fraction of points that are more likely under their own label, (S,)."""
     more_likely = label_posterior(ensemble.log_prob, held.points) > 0.5
-    return (more_likely == (held.condition[..., 0] > 0.5)).double().mean(1)
+    return (more_likely == (held.condition[..., 0] > 0.5)).double().mean(1).numpy()
 
 
 @th.no_grad()
@@ -144,22 +152,14 @@ def integral(model: FlowModel, condition: th.Tensor, cells: int) -> float:
     return total * (2 * REACH / (cells - 1)) ** 2
 
 
-@th.no_grad()
-def _angle_rows(ensemble: Ensemble, scale: Scale) -> list[Row]:
+def _angles(ensemble: Ensemble, scale: Scale) -> pd.DataFrame:
     """Score new points at single angles, with the same noise at each angle."""
     rows = []
     for kind, angles in angles_to_score(scale).items():
         for angle in angles:
             one = AngleMoons(np.array([angle]))
             samples = [one.draw(scale.n_per_angle, ANGLE_SEED + s) for s in ensemble.seeds]
-            data = as_data(samples, [one.scaler(sample) for sample in samples])
-            nll = mean_nll(ensemble, data)
-            rows += [
-                {"seed": seed, "kind": kind, "angle": round(float(angle), 4), "nll": float(value)}
-                for seed, value in zip(ensemble.seeds, nll, strict=True)
-            ]
-    return rows
-
-
-def _standard_error(values: np.ndarray) -> float:
-    return float(values.std(ddof=1) / math.sqrt(len(values)))
+            nll = mean_nll(ensemble, as_data(samples, [one.scaler(sample) for sample in samples]))
+            each = zip(ensemble.seeds, nll.tolist(), strict=True)
+            rows += [(seed, kind, round(float(angle), 4), value) for seed, value in each]
+    return pd.DataFrame(rows, columns=["seed", "kind", "angle", "nll"])

@@ -51,7 +51,7 @@ AROUND = np.arange(8) * np.pi / 4
 def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw curves (2.3), samples (2.4), densities (2.5) and layers (2.1)."""
     ours = fits[0]
-    _save(_curves_figure(fits, ours.rows[0]["entropy"]), folder / "two-moons-curves.png")
+    _save(_curves_figure(fits, ours.fits["entropy"][0]), folder / "two-moons-curves.png")
 
     data, scaler = TwoMoons(), ours.scalers[ours.middle]
     points = scaler.apply(data.draw(data.n_train, ours.ensemble.seeds[ours.middle]).points)
@@ -78,12 +78,13 @@ def _curves_figure(fits: Sequence[Fitted], limit: float) -> Figure:
     """Draw likelihoods over epochs: every seed and the interquartile mean."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    for axes, title in ((left, "training sample"), (right, "sample not trained on")):
+    titles = {"train": "training sample", "other": "sample not trained on"}
+    for axes, (column, title) in zip((left, right), titles.items(), strict=True):
         for fitted in fits:
-            curves, (label, color) = fitted.curves, STYLES[fitted.model]
-            nll = (curves.train if axes is left else curves.validation).numpy()
-            axes.plot(curves.epoch, nll, color=color, linewidth=0.5, alpha=0.35)
-            axes.plot(curves.epoch, trim_mean(nll, 0.25, axis=1), color=color, label=label)
+            label, color = STYLES[fitted.model]
+            nll = fitted.curves.pivot(index="epoch", columns="seed", values=column)
+            axes.plot(nll, color=color, linewidth=0.5, alpha=0.35)
+            axes.plot(nll.index, trim_mean(nll, 0.25, axis=1), color=color, label=label)
         axes.axhline(limit, color="black", linestyle="--", linewidth=1)
         axes.annotate(
             "entropy of the data: no model can be lower",
@@ -190,22 +191,18 @@ def _angle_nll_figure(fitted: Fitted) -> Figure:
     """Draw the held-out likelihood over the angle, for every seed."""
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     wide, close = figure.subplots(1, 2, width_ratios=(1.4, 1))
-    rows = sorted(fitted.angle_rows, key=lambda row: (row["angle"], row["seed"]))
-    n_seeds = len(fitted.ensemble.seeds)
-    angles = np.array([row["angle"] for row in rows[::n_seeds]])
-    kinds = np.array([row["kind"] for row in rows[::n_seeds]])
-    nll = np.array([row["nll"] for row in rows]).reshape(-1, n_seeds)
-    median, limit = np.median(nll, axis=1), fitted.rows[0]["entropy"]
+    nll = fitted.angles.pivot(index="angle", columns="seed", values="nll")
+    median, limit = nll.median(axis=1), fitted.fits["entropy"][0]
     for axes in (wide, close):
-        axes.plot(angles, nll, color=BLUE, linewidth=0.5, alpha=0.4)
-        axes.plot(angles, median, color=BLUE, label="median of the seeds")
+        axes.plot(nll, color=BLUE, linewidth=0.5, alpha=0.4)
+        axes.plot(median, color=BLUE, label="median of the seeds")
         axes.axhline(limit, color="black", linestyle="--", linewidth=1, label="entropy of the data")
         axes.axvspan(0, 2.1, color="#000000", alpha=0.06, linewidth=0, label="trained range")
         axes.set(xlabel="angle, radian")
         axes.spines[["top", "right"]].set_visible(False)
     for kind, marker in (("trained", "o"), ("between", "x")):
-        x, y = angles[kinds == kind], median[kinds == kind]
-        close.plot(x, y, marker, color=BLUE, markersize=4, label=f"{kind} angles, median")
+        own = median[fitted.angles.loc[fitted.angles["kind"] == kind, "angle"].unique()]
+        close.plot(own, marker, color=BLUE, markersize=4, label=f"{kind} angles, median")
     wide.set(ylabel="held-out NLL, nats", yscale="symlog", title="full circle")
     wide.set_ylim(bottom=limit - 0.5)
     close.set(xlim=(-0.1, 2.2), ylim=(limit - 0.05, limit + 0.4), title="trained range, enlarged")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
-from typing import Any
+
+import pandas as pd
 
 from sb3_flowpolicy.common.files import write_text
-from sb3_flowpolicy.density.measure import Row
+from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
 from sb3_flowpolicy.density.studies import STUDIES, Study
-from sb3_flowpolicy.density.verdicts import CHECKS, by_model, interval, sound
+from sb3_flowpolicy.density.verdicts import CHECKS, sound
 
 # Study -> picture -> caption, and the thesis's finding in our words.
 PICTURES = {
@@ -85,24 +85,23 @@ def write_report(folder: Path) -> str:
 
 
 def _section(study: Study, folder: Path) -> str:
-    rows = read_csv(folder / f"{study.name}-fits.csv")
-    curves = read_csv(folder / f"{study.name}-curves.csv")
+    fits = pd.read_csv(folder / f"{study.name}-fits.csv")
+    curves = pd.read_csv(folder / f"{study.name}-curves.csv")
     path = folder / f"{study.name}-angles.csv"
-    angles = read_csv(path) if path.exists() else []
+    angles = pd.read_csv(path) if path.exists() else pd.DataFrame()
     models = ["| model | NLL | gap | train NLL | NLL of each seed |", "|---|---|---|---|---|"]
-    for model, own in by_model(rows).items():
-        cells = [interval([row[key] for row in own]) for key in ("nll", "gap", "train_nll")]
-        texts = ["{:.3f} [{:.3f}, {:.3f}]".format(*cell) for cell in cells]
-        each = " ".join(f"{row['nll']:.2f}" for row in own)
-        models.append(f"| {model} | {' | '.join(texts)} | {each} |")
+    for model, own in fits.groupby("model", sort=False):
+        cells = [_interval(own[name]) for name in ("nll", "gap", "train_nll")]
+        each = " ".join(f"{nll:.2f}" for nll in own["nll"])
+        models.append(f"| {model} | {' | '.join(cells)} | {each} |")
     criteria = ["| criterion | measured | holds |", "|---|---|---|"]
-    for rule, seen, holds in (*CHECKS[study.name](rows, curves, angles), *sound(rows)):
+    for rule, seen, holds in (*CHECKS[study.name](fits, curves, angles), *sound(fits)):
         criteria.append(f"| {rule} | {seen} | {'yes' if holds else '**no**'} |")
     parts = [
         f"## {study.claim} `{study.name}`: {study.title}",
         f"**The thesis:** {study.thesis}",
-        f"**Entropy of the data**, the lower limit of the NLL: {rows[0]['entropy']:.3f} nats. "
-        f"Seeds: {len({row['seed'] for row in rows})}.",
+        f"**Entropy of the data**, the lower limit of the NLL: {fits['entropy'][0]:.3f} nats. "
+        f"Seeds: {fits['seed'].nunique()}.",
         "\n".join(models),
         "\n".join(criteria),
     ]
@@ -114,16 +113,6 @@ def _section(study: Study, folder: Path) -> str:
     return "\n\n".join(parts)
 
 
-def read_csv(path: Path) -> list[Row]:
-    """Read rows; texts that look like numbers become numbers."""
-    with path.open(newline="") as file:
-        return [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
-
-
-def _number(text: str) -> Any:
-    for convert in (int, float):
-        try:
-            return convert(text)
-        except ValueError:
-            continue
-    return text
+def _interval(values: pd.Series) -> str:
+    mean = bootstrap_interquartile_mean(values.to_numpy(), seed=0)
+    return f"{mean.value:.3f} [{mean.low:.3f}, {mean.high:.3f}]"

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import multiprocessing
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+import pandas as pd
 import torch as th
 from tqdm import tqdm
 
 from sb3_flowpolicy.common.files import replacing
-from sb3_flowpolicy.density.measure import Fitted, Row, fit_and_measure
+from sb3_flowpolicy.density.measure import Fitted, fit_and_measure
 from sb3_flowpolicy.density.pictures import DRAW
 from sb3_flowpolicy.density.studies import STUDIES, Scale
 
@@ -34,10 +34,6 @@ def run_studies(
     """
     if not set(names) <= STUDIES.keys():
         raise ValueError(f"studies must be among {list(STUDIES)}, got {list(names)}")
-    if not seeds:
-        raise ValueError("seeds must be at least 1, got 0")
-    if jobs < 1:
-        raise ValueError(f"jobs must be at least 1, got {jobs}")
     folder.mkdir(parents=True, exist_ok=True)
     # The longest fits first, so that no process runs alone at the end.
     tasks = [(name, model) for name in names for model in STUDIES[name].epochs]
@@ -70,28 +66,8 @@ def _fits(
 
 def _write_tables(name: str, fits: Sequence[Fitted], folder: Path) -> None:
     """Write ``NAME-fits.csv``, ``NAME-curves.csv`` and, for angles, ``NAME-angles.csv``."""
-    curves = [
-        {"model": fitted.model, "seed": seed, "epoch": int(epoch), "train": train, "other": other}
-        for fitted in fits
-        for i, seed in enumerate(fitted.ensemble.seeds)
-        for epoch, train, other in zip(
-            fitted.curves.epoch,
-            fitted.curves.train[:, i].tolist(),
-            fitted.curves.validation[:, i].tolist(),
-            strict=True,
-        )
-    ]
-    write_csv(folder / f"{name}-fits.csv", [row for fitted in fits for row in fitted.rows])
-    write_csv(folder / f"{name}-curves.csv", curves)
-    angle_rows = [row for fitted in fits for row in fitted.angle_rows]
-    if angle_rows:
-        write_csv(folder / f"{name}-angles.csv", angle_rows)
-
-
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows of equal columns; floats with five digits after the point."""
-    with replacing(path) as draft, draft.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: f"{v:.5f}" if isinstance(v, float) else v for k, v in row.items()})
+    for kind in ("fits", "curves", "angles"):
+        table = pd.concat([getattr(fitted, kind) for fitted in fits])
+        if not table.empty:
+            with replacing(folder / f"{name}-{kind}.csv") as draft:
+                table.to_csv(draft, index=False, float_format="%.5f")

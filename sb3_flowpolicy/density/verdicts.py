@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import spearmanr
+import pandas as pd
+from scipy.stats import spearmanr, trim_mean
 
-from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
 from sb3_flowpolicy.density.datasets import TRAINING_ANGLES
-from sb3_flowpolicy.density.measure import Row
 
 # Tolerance of a density's integral on the grid.
 INTEGRAL_TOLERANCE = 0.01
@@ -26,47 +24,38 @@ class Verdict(NamedTuple):
     holds: bool
 
 
-def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the interquartile mean over seeds and its 95 % bootstrap interval."""
-    estimate = bootstrap_interquartile_mean(np.asarray(values, dtype=float), seed=0)
-    return float(estimate.value), float(estimate.low), float(estimate.high)
+def interquartile_mean(values: pd.Series) -> float:
+    """Return the mean of the middle half of the seeds."""
+    return float(trim_mean(values, 0.25))
 
 
-def by_model(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group rows by their model, in order of appearance."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row["model"], []).append(row)
-    return groups
-
-
-def sound(rows: Sequence[Row]) -> list[Verdict]:
+def sound(fits: pd.DataFrame) -> list[Verdict]:
     """Check that each fitted density integrates to 1 and that none beats the true density."""
     found = []
-    for model, own in by_model(rows).items():
-        # numpy's min and max, unlike Python's, return NaN, which fails the comparison.
-        low = np.min([row["integral_low"] for row in own])
-        high = np.max([row["integral_high"] for row in own])
-        closest = np.min([row["gap"] / row["gap_se"] for row in own])
+    for model, own in fits.groupby("model", sort=False):
+        # numpy's min and max, unlike those of pandas, return NaN, which fails the comparison.
+        low = own["integral_low"].to_numpy().min()
+        high = own["integral_high"].to_numpy().max()
+        closest = (own["gap"] / own["gap_se"]).to_numpy().min()
         found += [
             Verdict(
                 f"{model}: every fitted density integrates to 1 ± {INTEGRAL_TOLERANCE}",
                 f"{low:.4f} to {high:.4f}",
-                bool(low >= 1 - INTEGRAL_TOLERANCE and high <= 1 + INTEGRAL_TOLERANCE),
+                low >= 1 - INTEGRAL_TOLERANCE and high <= 1 + INTEGRAL_TOLERANCE,
             ),
             Verdict(
                 f"{model}: no seed beats the entropy by more than {SAMPLING_ERRORS:.0f} errors",
                 f"closest seed {closest:+.1f} standard errors from it",
-                bool(closest >= -SAMPLING_ERRORS),
+                closest >= -SAMPLING_ERRORS,
             ),
         ]
     return found
 
 
-def two_moons(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
+def two_moons(fits: pd.DataFrame, curves: pd.DataFrame, angles: pd.DataFrame) -> list[Verdict]:
     """D1: RealNVP against MAF and NAF."""
-    nll = {model: interval([row["nll"] for row in own])[0] for model, own in by_model(rows).items()}
-    above = {model: value - nll["realnvp"] for model, value in nll.items()}
+    nll = fits.groupby("model")["nll"].apply(interquartile_mean)
+    above = nll - nll["realnvp"]
     criteria = [
         ("RealNVP at least 0.05 nats below MAF", -above["maf"], above["maf"] >= 0.05),
         (
@@ -84,59 +73,52 @@ def two_moons(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row])
     return [Verdict(rule, f"{seen:+.3f} nats", holds) for rule, seen, holds in criteria]
 
 
-def label(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
+def label(fits: pd.DataFrame, curves: pd.DataFrame, angles: pd.DataFrame) -> list[Verdict]:
     """D2: likelihood within 250 epochs, and classification."""
-    nll = [row["nll"] for row in rows]
-    epochs = max(row["epoch"] for row in curves)
-    accuracy = [row["accuracy"] for row in rows]
+    nll, accuracy = interquartile_mean(fits["nll"]), interquartile_mean(fits["accuracy"])
+    epochs = curves["epoch"].max()
     return [
         Verdict(
             "at most 0.5 nats within 250 epochs",
-            f"{interval(nll)[0]:.3f} nats after at most {epochs} epochs, worst seed {max(nll):.3f}",
-            interval(nll)[0] <= 0.5 and epochs <= 250,
+            f"{nll:.3f} nats after at most {epochs} epochs, worst seed {fits['nll'].max():.3f}",
+            nll <= 0.5 and epochs <= 250,
         ),
         Verdict(
             "at least 99 % of new points classified correctly",
-            f"{interval(accuracy)[0]:.2%}, worst seed {min(accuracy):.2%}",
-            interval(accuracy)[0] >= 0.99,
+            f"{accuracy:.2%}, worst seed {fits['accuracy'].min():.2%}",
+            accuracy >= 0.99,
         ),
     ]
 
 
-def angle(rows: Sequence[Row], curves: Sequence[Row], angles: Sequence[Row]) -> list[Verdict]:
+def angle(fits: pd.DataFrame, curves: pd.DataFrame, angles: pd.DataFrame) -> list[Verdict]:
     """D3: between the training angles, and outside of them."""
-    seeds = sorted({row["seed"] for row in angles})
-    of_kind = {
-        (kind, seed): [row for row in angles if (row["kind"], row["seed"]) == (kind, seed)]
-        for kind in ("trained", "between", "outside")
-        for seed in seeds
-    }
-    between, trained = (
-        interval([np.mean([row["nll"] for row in of_kind[kind, seed]]) for seed in seeds])[0]
-        for kind in ("between", "trained")
+    nll = angles.groupby(["kind", "seed"])["nll"].mean()
+    rise = interquartile_mean(nll["between"]) - interquartile_mean(nll["trained"])
+    outside = angles[angles["kind"] == "outside"]
+    correlations = pd.Series(
+        [_correlation_with_distance(own) for _, own in outside.groupby("seed")]
     )
-    correlations = [_correlation_with_distance(of_kind["outside", seed]) for seed in seeds]
     return [
         Verdict(
             "between training angles within 0.05 nats of training angles",
-            f"{between - trained:+.4f} nats",
-            abs(between - trained) <= 0.05,
+            f"{rise:+.4f} nats",
+            abs(rise) <= 0.05,
         ),
         Verdict(
             "worsens steadily over the first radian outside: rank correlation with distance > 0.8",
-            f"{interval(correlations)[0]:.2f}, worst seed {min(correlations):.2f}",
-            interval(correlations)[0] > 0.8,
+            f"{interquartile_mean(correlations):.2f}, worst seed {correlations.min():.2f}",
+            interquartile_mean(correlations) > 0.8,
         ),
     ]
 
 
-def _correlation_with_distance(outside: Sequence[Row]) -> float:
+def _correlation_with_distance(outside: pd.DataFrame) -> float:
     """Rank correlation of NLL and distance over the first radian outside, mean of both sides."""
     correlations = []
-    for distance in (lambda angle: angle - TRAINING_ANGLES[-1], lambda angle: 2 * np.pi - angle):
-        near = [(distance(row["angle"]), row["nll"]) for row in outside]
-        near = [pair for pair in near if pair[0] < 1]
-        correlations.append(float(spearmanr(*zip(*near, strict=True)).statistic))
+    for distance in (outside["angle"] - TRAINING_ANGLES[-1], 2 * np.pi - outside["angle"]):
+        near = distance < 1
+        correlations.append(spearmanr(distance[near], outside["nll"][near]).statistic)
     return float(np.mean(correlations))
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
 import sys
 from pathlib import Path
 
-from sb3_flowpolicy.common.command_line import HelpFormatter
+from sb3_flowpolicy.common.command_line import HelpFormatter, at_least
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
@@ -81,8 +82,6 @@ def _run(args: argparse.Namespace) -> None:
     missing = what_is_missing(experiment)
     if missing:
         raise ValueError(f"{experiment.name} needs {missing}, which is not installed")
-    if args.workers < 1:
-        raise ValueError(f"--workers must be at least 1, got {args.workers}")
     if args.address is not None and args.backend != "ray":
         raise ValueError(f"--address needs --backend ray, got {args.backend!r}")
     plan = make_plan(
@@ -99,7 +98,8 @@ def _run(args: argparse.Namespace) -> None:
             f"Results: {folder}"
         )
         if items:
-            with Progress(plan.items, sorted(finished), shown=not args.no_progress) as progress:
+            bar = Progress(plan.items, sorted(finished), shown=not args.no_progress)
+            with contextlib.closing(bar) as progress:
                 if args.backend == "ray":
                     from sb3_flowpolicy.experiments.ray_backend import run_on_ray
 
@@ -146,13 +146,18 @@ def _parser() -> argparse.ArgumentParser:
             add("name", metavar="NAME", help="experiment; `list` shows them")
             add(
                 "--seeds",
-                type=int,
+                type=at_least(1),
                 help=f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})",
             )
-            add("--first-seed", type=int, default=FIRST_SEED, help="1 for results, 100 for tuning")
+            add(
+                "--first-seed",
+                type=at_least(0),
+                default=FIRST_SEED,
+                help="1 for results, 100 for tuning",
+            )
             add(
                 "--steps",
-                type=int,
+                type=at_least(1),
                 help=f"steps per seed (default: the experiment's; quick: {QUICK_STEPS})",
             )
             add("--backend", choices=("local", "ray"), default="local", help="where to run")
@@ -161,7 +166,7 @@ def _parser() -> argparse.ArgumentParser:
             add("--out", type=Path, help=f"folder for results (default: {outs}, by profile)")
             add(
                 "--seeds-per-item",
-                type=int,
+                type=at_least(1),
                 default=SEEDS_PER_ITEM,
                 help="seeds trained together in a process; fewer spread over more machines",
             )
@@ -173,7 +178,12 @@ def _parser() -> argparse.ArgumentParser:
                 default="full",
                 help="quick: two seeds and few steps, to check that everything works",
             )
-            add("--workers", type=int, default=cores, help="processes at a time, one core each")
+            add(
+                "--workers",
+                type=at_least(1),
+                default=cores,
+                help="processes at a time, one core each",
+            )
         if name == "report":
             add("--results", type=Path, default=OUT["full"], help="folder that `run` wrote")
             add("--html", type=Path, help="page to write (default: report.html in it)")

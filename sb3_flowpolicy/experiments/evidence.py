@@ -46,7 +46,7 @@ class Evidence:
         others: Returns the evidence of another experiment by name, None if there is none.
 
     Raises:
-        ValueError: If a file is corrupt, or rows of a finished item are missing.
+        ValueError: If a file is corrupt, or was changed since its item was finished.
     """
 
     def __init__(
@@ -59,7 +59,10 @@ class Evidence:
         self.settings = read_settings(folder) or {}
         self.items: dict[str, dict[str, Any]] = self.settings.get("items", {})
         self.files = {key: ItemFiles(folder, key) for key in self.items}
-        self.done = {key: files.read_done() for key, files in self.files.items()}
+        self.done = {
+            key: self.files[key].read_done(item["steps"], item["seeds"])
+            for key, item in self.items.items()
+        }
 
     def judge(self) -> tuple[str, list[Finding]]:
         """Apply the experiment's rule; return the verdict and the result of each check."""
@@ -101,7 +104,8 @@ class Evidence:
         logs: dict[tuple[str, str], dict[int, list[Row]]] = {}
         for key, item in self.items.items():
             seeds = logs.setdefault((item["setting"], item["agent"]), {})
-            seeds |= self.files[key].rows_of_seeds(item, self.done[key])
+            for row in self.files[key].read_rows():
+                seeds.setdefault(int(row["seed"] or 0), []).append(row)
         return logs
 
     @cached_property

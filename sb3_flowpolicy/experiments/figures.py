@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
 
 from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean, interquartile_mean
 from sb3_flowpolicy.diagnostics.figures import new_figure
@@ -33,7 +34,7 @@ COLORS = {
     "spline-pink": "#cab2d6",
 }
 # Color of a field whose seeds all succeed; white if none does.
-_FULL = np.array([0.0, 0.447, 0.698])
+_FULL = COLORS["flow"]
 # Fields above this share are so dark that their text has to be white.
 _DARK = 0.6
 PANELS = ("train_return", "test_return", "test_success", "entropy", "ent_coef")
@@ -85,8 +86,14 @@ def curves_figure(evidence: Evidence) -> Figure:
                 axes.set_title(WORDS.get(metric, metric), fontsize=10)
         if rows > 1:
             row[0].set_ylabel(setting.name, fontsize=10)
-    handles, labels = _legend(grid)
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    handles = {
+        label: handle
+        for axes in grid.flat
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        handles.values(), handles, loc="outside upper center", ncols=len(handles), frameon=False
+    )
     return figure
 
 
@@ -116,14 +123,6 @@ def _scale(axes: Axes, metric: str) -> None:
         axes.set_ylim(-0.03, 1.03)
     if metric == "ent_coef":
         axes.set_yscale("log")
-
-
-def _legend(grid: np.ndarray) -> tuple[list, list]:
-    found: dict[str, Any] = {}
-    for axes in grid.flat:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    return list(found.values()), list(found)
 
 
 def profile_figure(evidence: Evidence) -> Figure | None:
@@ -158,35 +157,33 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
     where success was not measured.
     """
     experiment = evidence.experiment
-    fields = {
-        (row, column): (evidence.solved(setting.name, agent.name), setting.name, agent.name)
-        for column, setting in enumerate(experiment.settings)
-        for row, agent in enumerate(experiment.agents)
-        if "test_success" in evidence.columns(setting.name, agent.name)
-    }
     columns, rows = len(experiment.settings), len(experiment.agents)
-    if columns < 2 or not fields:
+    if columns < 2:
         return None
     figure = new_figure(1.6 + 1.5 * columns, 0.9 + 0.5 * rows)
     axes = figure.subplots()
-    for (row, column), (solved, setting, agent) in fields.items():
-        share = solved.mean()
-        axes.fill_between([column, column + 1], row, row + 1, color=1 - share * (1 - _FULL))
+    shares = np.full((rows, columns), np.nan)
+    for row, column in np.ndindex(rows, columns):
+        setting, agent = experiment.settings[column].name, experiment.agents[row].name
+        if "test_success" not in evidence.columns(setting, agent):
+            continue
+        solved = evidence.solved(setting, agent)
+        shares[row, column] = share = solved.mean()
         text = f"{solved.sum()} of {len(solved)}"
         if evidence.solved_once(setting, agent).any():
             steps = interquartile_mean(evidence.steps_until_solved(setting, agent))
             text += f"\n{float(steps.value):,.0f} steps"
         shade = "white" if share > _DARK else "black"
         axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=8, color=shade)
-    axes.set(xlim=(0, columns), ylim=(rows, 0))
+    if np.isnan(shares).all():
+        return None
+    white_to_blue = LinearSegmentedColormap.from_list("shares", ["white", _FULL])
+    axes.pcolormesh(shares, cmap=white_to_blue, vmin=0, vmax=1, edgecolors="white", linewidth=3)
+    axes.invert_yaxis()
     axes.set_xticks([k + 0.5 for k in range(columns)], [one.name for one in experiment.settings])
     axes.set_yticks([k + 0.5 for k in range(rows)], [agent.label for agent in experiment.agents])
     axes.xaxis.tick_top()
     axes.tick_params(length=0, labelsize=8)
-    for k in range(1, columns):
-        axes.axvline(k, color="white", linewidth=3)
-    for k in range(1, rows):
-        axes.axhline(k, color="white", linewidth=3)
     axes.spines[:].set_visible(False)
     axes.set_title("seeds that solve it at the end,\nand steps until they first do", fontsize=9)
     return figure

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import difflib
 
-import gymnasium as gym
-
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.exploration_claims import EXPLORATION_CLAIMS
 from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS
-from sb3_flowpolicy.experiments.measures import MEASURES, TRAINING_INFOS
 from sb3_flowpolicy.experiments.tunnel_claims import TUNNEL_CLAIMS
 from sb3_flowpolicy.experiments.work import register_env
 
@@ -24,8 +21,6 @@ EXPERIMENTS: dict[str, Experiment] = {
     )
 }
 """Name to experiment, in the order of the claims."""
-
-_KNOWN_MEASURES = {"profile", *MEASURES, *TRAINING_INFOS}
 
 
 def find(name: str) -> Experiment:
@@ -47,12 +42,9 @@ def find(name: str) -> Experiment:
 
 def what_is_missing(experiment: Experiment) -> str | None:
     """Return what an experiment needs that is not installed; None if it can run."""
-    for setting in experiment.settings:
-        try:
+    try:
+        for setting in experiment.settings:
             register_env(setting.env_id)
-        except ModuleNotFoundError:
-            return 'PyBullet: pip install "sb3_flowpolicy[bullet]"'
-        if setting.env_id not in gym.registry:
-            return f"the environment {setting.env_id}"
-    unknown = [name for name in experiment.measures if name not in _KNOWN_MEASURES]
-    return f"measurements of {', '.join(unknown)}" if unknown else None
+    except ModuleNotFoundError:
+        return 'PyBullet: pip install "sb3_flowpolicy[bullet]"'
+    return None

@@ -44,37 +44,19 @@ def profile_plot(evidence: Evidence, setting: str) -> go.Figure | None:
 
 def _add(figure: go.Figure, agent: Agent, x: np.ndarray, values: np.ndarray) -> None:
     shade, mean = color(agent), bootstrap_interquartile_mean(values)
-    group: dict[str, Any] = {"legendgroup": agent.name, "mode": "lines"}
+    group: dict[str, Any] = {"name": agent.label, "legendgroup": agent.name, "mode": "lines"}
+    silent = {**group, "hoverinfo": "skip", "showlegend": False}
     # One trace for all seeds, with gaps in between: a phone draws few traces quickly.
-    figure.add_scatter(
-        x=[number for _ in values for number in [*_short(x), None]],
-        y=[number for seed in values for number in [*_short(seed), None]],
-        line={"color": shade, "width": 0.6},
-        opacity=0.4,
-        hoverinfo="skip",
-        showlegend=False,
-        name=f"{agent.label}, seeds",
-        **group,
-    )
-    figure.add_scatter(
-        x=[*_short(x), *_short(x[::-1])],
-        y=[*_short(mean.high), *_short(mean.low[::-1])],
-        fill="toself",
-        fillcolor=shade,
-        line={"width": 0},
-        opacity=0.18,
-        hoverinfo="skip",
-        showlegend=False,
-        name=f"{agent.label}, interval",
-        **group,
-    )
-    figure.add_scatter(
-        x=_short(x),
-        y=_short(mean.value),
-        line={"color": shade, "width": 2.5},
-        name=agent.label,
-        **group,
-    )
+    each_x = [number for _ in values for number in [*_short(x), None]]
+    each_y = [number for seed in values for number in [*_short(seed), None]]
+    thin = {"color": shade, "width": 0.6}
+    figure.add_scatter(x=each_x, y=each_y, line=thin, opacity=0.4, **silent)
+    around = [*_short(x), *_short(x[::-1])]
+    band = [*_short(mean.high), *_short(mean.low[::-1])]
+    fill = {"fill": "toself", "fillcolor": shade, "line": {"width": 0}}
+    figure.add_scatter(x=around, y=band, opacity=0.18, **fill, **silent)
+    bold = {"color": shade, "width": 2.5}
+    figure.add_scatter(x=_short(x), y=_short(mean.value), line=bold, **group)
 
 
 def _dress(figure: go.Figure, title: str, x_title: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import TracebackType
 
 from tqdm import tqdm
 
@@ -24,9 +23,10 @@ class Progress:
     ) -> None:
         self.items = {item.key: item for item in items}
         self.steps = {item.key: item.steps for item in items if item.key in finished}
+        amounts = {item.key: item.steps * len(item.seeds) for item in items}
         self.bar = tqdm(
-            total=sum(item.steps * len(item.seeds) for item in items),
-            initial=sum(item.steps * len(item.seeds) for item in items if item.key in finished),
+            total=sum(amounts.values()),
+            initial=sum(amounts[key] for key in finished),
             desc="all",
             unit=" steps",
             unit_scale=True,
@@ -50,15 +50,6 @@ class Progress:
         self.bar.set_postfix_str(", ".join(f"{k} {v:.0%}" for k, v in shares.items()), False)
         self.bar.update(gained)
 
-    def __enter__(self) -> Progress:
-        """Start."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close the bar."""
         self.bar.close()

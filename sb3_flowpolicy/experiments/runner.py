@@ -12,12 +12,13 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from filelock import FileLock, Timeout
 
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
-from sb3_flowpolicy.experiments.work import Plan, WorkItem, describe, item_seconds
+from sb3_flowpolicy.experiments.work import Plan, WorkItem, item_seconds
 
 # OpenMP and numba read these when a process starts: one thread each, one process per core.
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -51,15 +52,11 @@ def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
 
 def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
     """Return the items to do; raise ``ValueError`` if files of a finished one are damaged."""
-    found = []
-    for item in plan.items:
-        files = ItemFiles(folder, item.key)
-        done = files.read_done()
-        if done is None:
-            found.append(item)
-        else:
-            files.rows_of_seeds(describe(item), done)
-    return found
+    return [
+        item
+        for item in plan.items
+        if ItemFiles(folder, item.key).read_done(item.steps, item.seeds) is None
+    ]
 
 
 def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
@@ -79,7 +76,7 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
     context = multiprocessing.get_context("spawn")
     reports = context.Queue()
     with (
-        _one_thread_each(),
+        mock.patch.dict(os.environ, dict.fromkeys(ONE_THREAD, "1")),
         ProcessPoolExecutor(
             min(workers, len(items)), context, initializer=_start_worker, initargs=(reports,)
         ) as pool,
@@ -112,20 +109,6 @@ def _pass_on(reports: Any, progress: Progress) -> None:
             progress.update(*reports.get_nowait())
         except queue.Empty:
             return
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _start_worker(reports: Any) -> None:

@@ -13,6 +13,7 @@ and ``checkpoints/KEY`` while the item is unfinished.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import math
@@ -22,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_flowpolicy.common.files import read_json, require, write_json
+from sb3_flowpolicy.common.files import read_json, write_json
 
 SCHEMA = 1
 """Version of the files; raised when they change their meaning."""
@@ -35,21 +36,9 @@ Row = dict[str, float | None]
 
 # What the files hold, see common.files.require.
 _SETTINGS_FIELDS = {"schema": int, "experiment": str, "steps": int, "seeds": list, "items": dict}
-_ITEM_FIELDS = {"setting": str, "agent": str, "seeds": list, "steps": int}
 _DONE_FIELDS = {
     **{"key": str, "steps": int, "seeds": list, "table": int, "details": int, "sha256": str},
-    **{"cpu_seconds": (int, float), "steps_per_second": (int, float)},
-    "machine": {
-        **{"commit": (str, type(None)), "cpu_count": (int, type(None))},
-        **{"processor": str, "python": str, "versions": dict},
-    },
-}
-_DETAIL_FIELDS = {
-    "profile": {"seed": int, "way": list, "entropy": list},
-    "picture": {
-        **{"seed": int, "step": int, "steps": list},
-        **{"positions": list, "samples": list, "trail": list},
-    },
+    **{"cpu_seconds": (int, float), "steps_per_second": (int, float), "machine": dict},
 }
 _ADVICE = "restore the file, or delete all files of this item and run it again"
 
@@ -74,8 +63,6 @@ def read_settings(folder: Path) -> dict[str, Any] | None:
             f"{path} must be in a folder named after its experiment, "
             f"{settings['experiment']!r}, got {folder.name!r}"
         )
-    for key, item in settings["items"].items():
-        require(f"{path}: {key}", item, _ITEM_FIELDS)
     return settings
 
 
@@ -201,89 +188,44 @@ class ItemFiles:
         """Return the table; of an unfinished item, up to the last whole line.
 
         Raises:
-            ValueError: If a line is corrupt; the message names file and line.
+            ValueError: If a line is corrupt.
         """
-        lines = self._lines(self.table)
-        if not lines:
-            return []
-        columns = lines[0].rstrip("\n").split(",")  # as append_rows writes it, without quotes
-        missing = [name for name in BASIC_COLUMNS if name not in columns]
-        if missing:
-            raise ValueError(f"{self.table}, line 1 must name the columns {missing}, got {columns}")
-        return [
-            _parse(self.table, number, line, columns)
-            for number, line in enumerate(lines[1:], start=2)
-        ]
+        try:
+            return [
+                {name: float(cell) if cell else None for name, cell in row.items()}
+                for row in csv.DictReader(_whole_lines(self.table))
+            ]
+        except ValueError as error:
+            raise ValueError(f"{self.table} must hold numbers: {error}; {_ADVICE}") from error
 
     def read_details(self) -> list[dict[str, Any]]:
-        """Return what :meth:`append_detail` wrote.
+        """Return what :meth:`append_detail` wrote, up to the last whole line."""
+        return [json.loads(line) for line in _whole_lines(self.details)]
 
-        Raises:
-            ValueError: If a line is corrupt; the message names file and line.
-        """
-        found = []
-        for number, line in enumerate(self._lines(self.details), start=1):
-            where = f"{self.details}, line {number}"
-            try:
-                detail = json.loads(line)
-            except (ValueError, RecursionError) as error:
-                raise ValueError(f"{where} must be JSON, got {line[:60]!r}: {_ADVICE}") from error
-            require(where, detail, {"kind": str})
-            if detail["kind"] not in _DETAIL_FIELDS:
-                raise ValueError(
-                    f"{where} must be of a kind among {[*_DETAIL_FIELDS]}, got {detail['kind']!r}"
-                )
-            require(where, detail, _DETAIL_FIELDS[detail["kind"]])
-            found.append(detail)
-        return found
-
-    def _lines(self, path: Path) -> list[str]:
-        """Return the lines of a file; the last may be incomplete only if the item is finished."""
-        if not path.exists():
-            return []
-        lines = path.read_text(errors="replace").splitlines(keepends=True)
-        if lines and not lines[-1].endswith("\n") and not self.finished:
-            lines.pop()  # it is being written, or the run was interrupted here
-        return lines
-
-    def read_done(self) -> dict[str, Any] | None:
+    def read_done(self, steps: int, seeds: Sequence[int]) -> dict[str, Any] | None:
         """Return the facts of a finished item, None of an unfinished one.
 
+        Args:
+            steps: Steps that the item must have done.
+            seeds: Seeds that it must have trained.
+
         Raises:
-            ValueError: If the file is corrupt, or another item's.
+            ValueError: If a file was changed since, or is another item's.
         """
         if not self.finished:
             return None
         done = read_json(self.done, _DONE_FIELDS)
         if done["key"] != self.key:
             raise ValueError(f"{self.done} must be of {self.key}, got {done['key']!r}: {_ADVICE}")
-        return done
-
-    def rows_of_seeds(
-        self, item: Mapping[str, Any], done: Mapping[str, Any] | None
-    ) -> dict[int, list[Row]]:
-        """Return the rows by seed, in order of steps; seeds without rows are left out.
-
-        Args:
-            item: The item's description in the folder's settings.
-            done: Facts from when it was finished; None if it is not.
-
-        Raises:
-            ValueError: If a line is corrupt or, once the item is finished, if a file was changed.
-        """
-        seeds, steps = list(item["seeds"]), item["steps"]
-        if done is not None and (done["seeds"] != seeds or done["steps"] < steps):
+        if done["seeds"] != list(seeds) or done["steps"] < steps:
             raise ValueError(
-                f"{self.done} must be of {steps} steps of seeds {seeds}, "
+                f"{self.done} must be of {steps} steps of seeds {list(seeds)}, "
                 f"got {done['steps']} of {done['seeds']}"
             )
-        logs: dict[int, list[Row]] = {}
-        for row in self.read_rows():  # first, as its errors name the line
-            logs.setdefault(int(row["seed"] or 0), []).append(row)
-        damage = None if done is None else self.damage(done)
+        damage = self.damage(done)
         if damage:
             raise ValueError(f"{damage}: {_ADVICE}")
-        return logs
+        return done
 
 
 def commits_of(done: Mapping[str, Any]) -> list[str | None]:
@@ -300,24 +242,10 @@ def _format(value: float | None) -> str:
     return str(value) if isinstance(value, int) else f"{value:.5g}"
 
 
-def _parse(path: Path, number: int, line: str, columns: list[str]) -> Row:
-    try:
-        cells = [float(cell) if cell else None for cell in line.rstrip("\n").split(",")]
-    except ValueError:
-        cells = []
-    row = dict(zip(columns, cells, strict=False))
-    sound = (
-        line.endswith("\n")
-        and len(cells) == len(columns)
-        and None not in (row["seed"], row["step"])
-        and all(value is None or math.isfinite(value) for value in cells)
-    )
-    if not sound:
-        raise ValueError(
-            f"{path}, line {number} must hold {len(columns)} finite numbers "
-            f"({','.join(columns)}), got {line[:80]!r}: {_ADVICE}"
-        )
-    return row
+def _whole_lines(path: Path) -> list[str]:
+    """Return the lines of a file without the last if it is being written or was interrupted."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    return [line for line in lines if line.endswith("\n")]
 
 
 def _append(path: Path, text: str) -> None:

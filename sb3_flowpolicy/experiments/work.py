@@ -121,20 +121,10 @@ def make_plan(
         first_seed: The seeds are this one and those after it.
         seeds_per_item: How many seeds are trained in one process, at most. Fewer make more items
             to spread over machines, more make better use of each.
-
-    Returns:
-        The plan.
-
-    Raises:
-        ValueError: If an argument is out of range.
     """
     quick = profile == "quick"
     steps = (QUICK_STEPS if quick else experiment.steps) if steps is None else steps
     seeds = (QUICK_SEEDS if quick else experiment.seeds) if seeds is None else seeds
-    least = {"steps": (steps, 1), "seeds": (seeds, 1), "seeds_per_item": (seeds_per_item, 1)}
-    for name, (value, bound) in {**least, "first_seed": (first_seed, 0)}.items():
-        if value < bound:
-            raise ValueError(f"{name} must be at least {bound}, got {value}")
     chosen = tuple(range(first_seed, first_seed + seeds))
     groups = [chosen[i : i + seeds_per_item] for i in range(0, seeds, seeds_per_item)]
     items = [
@@ -254,7 +244,7 @@ def item_seconds(item: WorkItem) -> float:
 
 def plan_seconds(plan: Plan, workers: int) -> float:
     """Estimate the time of a plan: each free worker takes the longest remaining item."""
-    loads = [0.0] * max(1, workers)
+    loads = [0.0] * workers
     for seconds in sorted((item_seconds(item) for item in plan.items), reverse=True):
         loads[loads.index(min(loads))] += seconds
     return max(loads)

@@ -56,10 +56,6 @@ def test_a_run_leaves_results_and_is_not_repeated(
     ("arguments", "message"),
     [
         (["sparse-fixed-alfa"], "did you mean 'sparse-fixed-alpha'"),
-        (["tiny", "--seeds", "0"], "seeds must be at least 1, got 0"),
-        (["tiny", "--steps", "-5"], "steps must be at least 1, got -5"),
-        (["tiny", "--seeds-per-item", "0"], "seeds_per_item must be at least 1, got 0"),
-        (["tiny", "--workers", "0"], "--workers must be at least 1, got 0"),
         (["tiny", "--address", "auto"], "--address needs --backend ray, got 'local'"),
     ],
 )
@@ -73,6 +69,15 @@ def test_wrong_arguments_are_errors_that_help(
     assert main(["run", *arguments, "--out", str(tmp_path)]) == 1
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("option", ["--seeds", "--steps", "--seeds-per-item", "--workers"])
+def test_counts_are_at_least_one(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["run", "tiny", option, "0", "--out", str(tmp_path)])
+    assert f"argument {option}: value must be an integer of at least 1" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -49,7 +50,7 @@ def test_no_seed_is_lost_with_a_node(tiny: Experiment, tmp_path: Path) -> None:
         killer = threading.Thread(target=kill_in_the_middle, daemon=True)
         with (
             results_folder(tmp_path / "ray", plan) as folder,
-            Watch(plan.items, shown=False) as progress,
+            closing(Watch(plan.items, shown=False)) as progress,
         ):
             killer.start()
             run_on_ray(folder, unfinished(folder, plan), progress)
@@ -62,7 +63,7 @@ def test_no_seed_is_lost_with_a_node(tiny: Experiment, tmp_path: Path) -> None:
         cluster.shutdown()
     with (
         results_folder(tmp_path / "local", plan) as local,
-        Progress(plan.items, shown=False) as progress,
+        closing(Progress(plan.items, shown=False)) as progress,
     ):
         run_local(local, plan.items, progress, workers=2)
     for item in plan.items:

@@ -62,7 +62,7 @@ def test_everything_is_measured(item: WorkItem, tmp_path: Path) -> None:
         ("profile", 1, 120),
         ("profile", 2, 120),
     ]
-    done = files.read_done()
+    done = files.read_done(item.steps, item.seeds)
     assert done is not None
     assert done["sessions"] == 1
     assert {"commit", "versions", "processor", "date"} <= done["machine"].keys()
@@ -107,7 +107,7 @@ def test_interrupted_runs_end_with_the_same_results(
         assert not files.finished
     run_item(item, folder, quiet)
     assert contents(folder) == contents(straight)
-    done = files.read_done()
+    done = files.read_done(item.steps, item.seeds)
     assert done is not None
     assert done["steps"] == 120
 
@@ -155,7 +155,7 @@ def test_all_commits_of_a_run_are_noted(
     files = _interrupt(item, tmp_path)
     monkeypatch.setattr(training, "machine", lambda: {**machine(), "commit": "def"})
     run_item(item, tmp_path, quiet)
-    done = files.read_done()
+    done = files.read_done(item.steps, item.seeds)
     assert done is not None
     assert done["commits"] == ["abc-dirty", "def"]
     assert done["machine"]["commit"] == "def"

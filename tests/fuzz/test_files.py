@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from sb3_flowpolicy.algorithms.demonstrations import KEYS, load_demonstrations
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, read_json
+from sb3_flowpolicy.common.files import read_json
 from tests.bundle.mutations import by_chance
 from tests.fuzz.effort import fuzz
 from tests.fuzz.test_configuration import ANYTHING, works_or_says_why
@@ -110,29 +110,19 @@ def test_arrays_that_promise_more_than_they_have_are_refused(tmp_path: Path) -> 
 
 
 @fuzz(300)
-@given(
-    table=st.binary(max_size=80)
-    | st.text(alphabet="0123456789.,-+einfa\n\r\"' \u2028\x0b\x00", max_size=80).map(str.encode),
-    head=st.booleans(),
-)
-def test_result_tables(tmp_path: Path, table: bytes, head: bool) -> None:
-    files = ItemFiles(tmp_path, "item")
-    files.table.write_bytes((",".join(BASIC_COLUMNS).encode() + b"\n") * head + table)
-    files.details.write_bytes(table)
-    rows = works_or_says_why(files.read_rows)
-    assert rows is None or all(np.isfinite(row["step"]) for row in rows)
-    details = works_or_says_why(files.read_details)
-    assert details is None or all(isinstance(one, dict) for one in details)
-    works_or_says_why(read_json, files.details)
+@given(content=st.binary(max_size=80))
+def test_json_files(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    works_or_says_why(read_json, tmp_path / "a.json")
 
 
 @fuzz(100)
 @given(value=ANYTHING.filter(lambda value: isinstance(value, dict | list | str | int | float)))
-def test_result_details_of_any_kind(tmp_path: Path, value: Any) -> None:
-    files = ItemFiles(tmp_path, "item")
-    files.details.write_text(json.dumps(value, default=str, skipkeys=True) + "\n")
-    details = works_or_says_why(files.read_details)
-    assert details is None or all(isinstance(one, dict) for one in details)
-    files.details.write_text("[" * 100_000 + "\n")
-    with pytest.raises(ValueError, match="line 1 must be JSON"):
-        files.read_details()
+def test_json_of_any_kind(tmp_path: Path, value: Any) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(value, default=str, skipkeys=True) + "\n")
+    content = works_or_says_why(read_json, path)
+    assert content is None or isinstance(content, dict)
+    path.write_text("[" * 100_000 + "\n")
+    with pytest.raises(ValueError, match="must be JSON"):
+        read_json(path)

@@ -47,7 +47,6 @@ along x, and along y; the two ways to turn the square."""
 # Rows: normal components along x and along y, tangential ones along x and along y.
 _GROUPS = np.abs([*INWARDS, MODES["joint x"][1], MODES["joint y"][1]]) > 0.0
 
-
 _JOINT = 0.1
 """Scale of the joint motions where the search of a low rank begins."""
 
@@ -119,10 +118,6 @@ def full(parameters: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _start_rank_2(parameters: Array) -> Array:
-    return np.concatenate([parameters, np.full(4, _JOINT)])
-
-
 def _start_full(parameters: Array) -> Array:
     x, y, along_x, along_y = parameters
     # All four fingers move and turn the square jointly, plus independent noise as before.
@@ -130,17 +125,13 @@ def _start_full(parameters: Array) -> Array:
     return np.array([x, y, 0.0, *joint_x, *joint_y, x, along_y, 1.0, 0.0])
 
 
-def _same(parameters: Array) -> Array:
-    return parameters
-
-
 INDEPENDENT_START = np.full(4, np.log(0.15))
 """Where the search of independent noise begins."""
 
 FAMILIES = {
-    "independent": Family(independent, _same),
-    "pink": Family(independent, _same, color=1.0),
-    "rank 2": Family(rank_2, _start_rank_2),
+    "independent": Family(independent, np.copy),
+    "pink": Family(independent, np.copy, color=1.0),
+    "rank 2": Family(rank_2, lambda independent: np.append(independent, np.full(4, _JOINT))),
     "full": Family(full, _start_full),
 }
 """Independent noise (a diagonal Gaussian), the same with pink noise, a low-rank Gaussian as in the

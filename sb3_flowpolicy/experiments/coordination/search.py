@@ -89,7 +89,7 @@ class Prediction:
     distance_std: float
     distance_max: float
     found: float
-    modes: dict[str, tuple[float, float]]
+    modes: dict[str, tuple[float, ...]]
 
 
 def setting_of(
@@ -200,7 +200,7 @@ def measure(
     covariance = root @ root.T
     entropy = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * np.e * covariance)[1]) + squashing
     gain = reward + setting.ent_coef * entropy - task.failure * hazard
-    metrics = dict(zip(METRICS, lengths @ batch.metrics / steps, strict=True))
+    metrics = dict(zip(METRICS, (lengths @ batch.metrics / steps).tolist(), strict=True))
     presses = np.tanh(INWARDS @ means / 2.0)
     return Prediction(
         press_x=float(presses[0]),
@@ -211,17 +211,14 @@ def measure(
         broken=int((batch.ends == kernels.BROKEN).sum()) / max(failures, 1),
         reward=float(reward),
         kept=float(reward / task.held) if task.held else 0.0,
-        x_std=float(metrics["x_std"]),
-        x_max=float(metrics["x_max"]),
-        distance_std=float(metrics["distance_std"]),
-        distance_max=float(metrics["distance_max"]),
+        x_std=metrics["x_std"],
+        x_max=metrics["x_max"],
+        distance_std=metrics["distance_std"],
+        distance_max=metrics["distance_max"],
         found=float(batch.found.mean()),
         modes={
-            name: (
-                float(np.sqrt(first @ covariance @ first)),
-                float(np.sqrt(second @ covariance @ second)),
-            )
-            for name, (first, second) in MODES.items()
+            name: tuple(float(np.sqrt(mode @ covariance @ mode)) for mode in pair)
+            for name, pair in MODES.items()
         },
     )
 
