@@ -1,37 +1,8 @@
-"""Curves over training: logs on a common grid, smoothed, and how often they swing."""
+"""Curves over training: smoothed, and how often they swing."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-
-
-def common_grid(steps: Sequence[np.ndarray]) -> np.ndarray:
-    """Return all steps at which any seed was measured, up to where the shortest log ends.
-
-    Example:
-        >>> common_grid([np.array([1, 2, 3]), np.array([2, 4])]).tolist()
-        [1, 2, 3]
-    """
-    last = min(one[-1] for one in steps)
-    grid = np.unique(np.concatenate(list(steps)))
-    return grid[grid <= last]
-
-
-def on_grid(grid: np.ndarray, steps: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate a log linearly; before its first value it is constant.
-
-    Args:
-        grid: Steps of the result, (T,).
-        steps: Steps of the measurements, increasing.
-        values: Measurements; NaN where there is none, but not everywhere.
-
-    Returns:
-        Values at the grid, (T,).
-    """
-    known = np.isfinite(values)
-    return np.interp(grid, steps[known], values[known])
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:

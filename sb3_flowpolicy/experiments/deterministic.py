@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch as th
 
 import flowpolicy_envs  # noqa: F401, registers the environments
@@ -88,10 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for env in args.envs:
         rows += compare(env, args.seeds, args.steps, args.every, args.episodes, ent_coef=ent_coef)
         if args.csv is not None:
-            with replacing(args.csv) as draft, draft.open("w", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
+            with replacing(args.csv) as draft:
+                pd.DataFrame(rows).to_csv(draft, index=False)
 
 
 if __name__ == "__main__":

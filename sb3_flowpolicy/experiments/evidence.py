@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from sb3_flowpolicy.experiments.curves import common_grid, on_grid, running_mean, swings
+from sb3_flowpolicy.experiments.curves import running_mean, swings
 from sb3_flowpolicy.experiments.experiment import (
     NOT_MEASURED,
     NOT_REPRODUCED,
@@ -20,7 +21,7 @@ from sb3_flowpolicy.experiments.experiment import (
     Finding,
     NotMeasuredError,
 )
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, Row, read_settings
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, read_settings
 
 # The share of evaluations, at the end of training, that "final" refers to, and the least number.
 FINAL_SHARE, FINAL_LEAST = 0.1, 3
@@ -100,13 +101,13 @@ class Evidence:
         return self.settings.get("seeds", [])
 
     @cached_property
-    def _logs(self) -> dict[tuple[str, str], dict[int, list[Row]]]:
-        logs: dict[tuple[str, str], dict[int, list[Row]]] = {}
+    def _logs(self) -> dict[tuple[str, str], pd.DataFrame]:
+        logs: dict[tuple[str, str], list[pd.DataFrame]] = {}
         for key, item in self.items.items():
-            seeds = logs.setdefault((item["setting"], item["agent"]), {})
-            for row in self.files[key].read_rows():
-                seeds.setdefault(int(row["seed"] or 0), []).append(row)
-        return logs
+            table = self.files[key].read_table()
+            if not table.empty:
+                logs.setdefault((item["setting"], item["agent"]), []).append(table)
+        return {pair: pd.concat(tables) for pair, tables in logs.items()}
 
     @cached_property
     def _details(self) -> dict[tuple[str, str], list[dict[str, Any]]]:
@@ -118,22 +119,19 @@ class Evidence:
 
     def has(self, setting: str, agent: str) -> bool:
         """Whether there is anything of this agent on this setting."""
-        return bool(self._logs.get((setting, agent)))
+        return (setting, agent) in self._logs
 
     def columns(self, setting: str, agent: str) -> list[str]:
         """Return the metrics that were measured for every seed of this agent."""
-        logs = self._logs.get((setting, agent), {})
-        if not logs:
+        if not self.has(setting, agent):
             return []
-        names = [name for name in next(iter(logs.values()))[0] if name not in BASIC_COLUMNS[:3]]
-        return [
-            name
-            for name in names
-            if all(any(row[name] is not None for row in rows) for rows in logs.values())
-        ]
+        counts = self._logs[setting, agent].groupby("seed").count()
+        return [name for name in counts if counts[name].all() and name not in BASIC_COLUMNS[:3]]
 
     def curves(self, setting: str, agent: str, metric: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return a metric of all seeds on a common grid.
+        """Return a metric of all seeds on a common grid: all steps at which any was measured.
+
+        Between measurements it is linear, before the first constant.
 
         Returns:
             Steps (T,) and values (S, T); the grid ends where the shortest log does.
@@ -143,14 +141,11 @@ class Evidence:
         """
         if metric not in self.columns(setting, agent):
             raise NotMeasuredError(f"{metric} of {agent} on {setting}")
-        logs = self._logs[setting, agent]
-        steps = [np.array([row["step"] for row in rows], np.float64) for rows in logs.values()]
-        values = [
-            np.array([np.nan if row[metric] is None else row[metric] for row in rows], np.float64)
-            for rows in logs.values()
-        ]
-        grid = common_grid(steps)
-        return grid, np.stack([on_grid(grid, *log) for log in zip(steps, values, strict=True)])
+        log = self._logs[setting, agent]
+        end = log.groupby("seed")["step"].max().min()
+        curves = log.pivot(index="step", columns="seed", values=metric)
+        curves = curves.interpolate(method="index").bfill().loc[:end]
+        return curves.index.to_numpy(), curves.to_numpy().T
 
     def final(self, setting: str, agent: str, metric: str) -> np.ndarray:
         """Return each seed's mean over the last tenth of its evaluations, (S,)."""

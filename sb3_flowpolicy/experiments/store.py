@@ -13,8 +13,8 @@ and ``checkpoints/KEY`` while the item is unfinished.
 
 from __future__ import annotations
 
-import csv
 import hashlib
+import io
 import json
 import math
 import os
@@ -22,6 +22,9 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from sb3_flowpolicy.common.files import read_json, write_json
 
@@ -184,17 +187,18 @@ class ItemFiles:
         write_json(self.done, {**facts, "key": self.key})
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
-    def read_rows(self) -> list[Row]:
+    def read_table(self) -> pd.DataFrame:
         """Return the table; of an unfinished item, up to the last whole line.
 
         Raises:
             ValueError: If a line is corrupt.
         """
+        lines = _whole_lines(self.table)
+        if not lines:
+            return pd.DataFrame(columns=list(BASIC_COLUMNS))
+        text = io.StringIO("".join(lines))
         try:
-            return [
-                {name: float(cell) if cell else None for name, cell in row.items()}
-                for row in csv.DictReader(_whole_lines(self.table))
-            ]
+            return pd.read_csv(text, dtype=np.float64, float_precision="round_trip")
         except ValueError as error:
             raise ValueError(f"{self.table} must hold numbers: {error}; {_ADVICE}") from error
 

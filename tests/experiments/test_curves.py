@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 import pytest
 
-from sb3_flowpolicy.experiments.curves import common_grid, on_grid, running_mean, swings
+from sb3_flowpolicy.experiments.curves import running_mean, swings
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.manifest import find
 
 
-def test_logs_of_unequal_length_meet_on_a_grid() -> None:
-    long, short = np.array([10.0, 20.0, 30.0, 40.0]), np.array([15.0, 25.0])
-    grid = common_grid([long, short])
-    assert grid.tolist() == [10, 15, 20, 25]
-    assert on_grid(grid, long, 2 * long).tolist() == [20, 30, 40, 50]
-    assert on_grid(grid, short, np.array([1.0, 3.0])).tolist() == [1, 1, 2, 3]
-    gap = np.array([0.0, np.nan, 4.0, 5.0])
-    assert on_grid(long, long, gap).tolist() == [0, 2, 4, 5]
+def test_logs_of_unequal_length_meet_on_a_grid(tmp_path: Path) -> None:
+    evidence = Evidence(find("circle-narrow"), tmp_path)
+    log = {
+        "seed": [1, 1, 1, 1, 2, 2],
+        "step": [10.0, 20.0, 30.0, 40.0, 15.0, 25.0],
+        "entropy": [20, np.nan, 60, 80, 1, 3],
+    }
+    evidence._logs = {("narrow", "flow"): pd.DataFrame(log)}
+    steps, values = evidence.curves("narrow", "flow", "entropy")
+    assert steps.tolist() == [10, 15, 20, 25]
+    assert values.tolist() == [[20, 30, 40, 50], [1, 1, 2, 3]]
 
 
 def test_running_mean_is_shorter_at_the_start() -> None:

@@ -21,24 +21,24 @@ def files(tmp_path: Path) -> ItemFiles:
 
 
 def test_rows_come_back(files: ItemFiles) -> None:
-    rows = files.read_rows()
-    assert [(row["seed"], row["step"]) for row in rows] == [(1, 100), (2, 100), (1, 200)]
-    assert rows[0]["train_success"] is None
-    assert rows[0]["entropy"] == 0.25
+    table = files.read_table()
+    assert table[["seed", "step"]].to_numpy().tolist() == [[1, 100], [2, 100], [1, 200]]
+    assert table["train_success"].isna().all()
+    assert table["entropy"][0] == 0.25
 
 
 def test_a_corrupt_line_is_noticed(files: ItemFiles) -> None:
     with open(files.table, "a") as file:
         file.write("1,300,oops,0,0,0,0,0,0\n")
     with pytest.raises(ValueError, match=r"circle-flow\.csv must hold numbers: .*'oops'"):
-        files.read_rows()
+        files.read_table()
 
 
 def test_half_a_line_is_not_read_and_goes_when_the_run_goes_on(files: ItemFiles) -> None:
     whole, noted = files.table.read_bytes(), files.fingerprint()
     with open(files.table, "a") as file:
         file.write("1,300,0.1")
-    assert len(files.read_rows()) == 3
+    assert len(files.read_table()) == 3
     files.cut_to(noted)
     assert files.table.read_bytes() == whole
 
