@@ -22,7 +22,7 @@ from sb3_flowpolicy.density.datasets import (
     TwoMoons,
     angle_condition,
 )
-from sb3_flowpolicy.density.measure import CHUNK, Fitted, label_posterior
+from sb3_flowpolicy.density.measure import Fitted, label_posterior
 from sb3_flowpolicy.density.models import FlowModel, OurRealNVP
 from sb3_flowpolicy.density.studies import Scale
 
@@ -266,11 +266,9 @@ def density_picture(
     model: FlowModel, condition: np.ndarray, extent: float, pixels: int
 ) -> np.ndarray:
     """Evaluate p(. | condition) at the pixel centers of a square, from the lowest y and x up."""
-    scores = [
-        model(points, th.from_numpy(condition).float().expand(len(points), -1))
-        for points in _pixel_centers(extent, pixels).split(CHUNK)
-    ]
-    return th.cat(scores).exp().reshape(pixels, pixels).numpy()
+    points = _pixel_centers(extent, pixels)
+    log_p = model(points, th.from_numpy(condition).float().expand(len(points), -1))
+    return log_p.exp().reshape(pixels, pixels).numpy()
 
 
 def _pixel_centers(extent: float, pixels: int) -> th.Tensor:

@@ -53,17 +53,11 @@ def compare(
             for seed, (mean, success) in zip(seeds, found, strict=True):
                 values = (env, settings["ent_coef"], seed, step, way, success, round(mean, 4))
                 rows.append(dict(zip(COLUMNS, values, strict=True)))
-        _print(env, step, rows[-len(WAYS) * len(seeds) :])
+        tested = pd.DataFrame(rows[-len(WAYS) * len(seeds) :])
+        success = tested.pivot(index="way", columns="seed", values="success").loc[list(WAYS)]
+        print(f"{env}, step {step}: success per seed\n{success}", flush=True)
     tests.close()
     return rows
-
-
-def _print(env: str, step: int, rows: Sequence[dict[str, Any]]) -> None:
-    print(f"{env}, step {step}: success per seed", flush=True)
-    for way in WAYS:
-        rates = [row["success"] for row in rows if row["way"] == way]
-        cells = " ".join("   -" if rate is None else f"{rate:4.2f}" for rate in rates)
-        print(f"  {way:10} {cells}", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -210,7 +210,7 @@ class Evidence:
 
     def profile(self, setting: str, agent: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return shares of the way (K,) and the entropy there (S, K) at the end of training."""
-        found = [one for one in self._details.get((setting, agent), []) if one["kind"] == "profile"]
+        found = self._kind("profile", setting, agent)
         if not found:
             return None
         return np.array(found[0]["way"]), np.array([one["entropy"] for one in found])
@@ -225,10 +225,10 @@ class Evidence:
 
     def pictures(self, setting: str, agent: str) -> list[dict[str, Any]]:
         """Return the recorded policies, in order of steps."""
-        found = self._details.get((setting, agent), [])
-        return sorted(
-            (one for one in found if one["kind"] == "picture"), key=lambda one: one["step"]
-        )
+        return sorted(self._kind("picture", setting, agent), key=lambda one: one["step"])
+
+    def _kind(self, kind: str, setting: str, agent: str) -> list[dict[str, Any]]:
+        return [one for one in self._details.get((setting, agent), []) if one["kind"] == kind]
 
 
 def _first(flags: np.ndarray) -> np.ndarray:

@@ -152,19 +152,23 @@ class ItemFiles:
                 digest.update(path.read_bytes())
         return {**lengths, "sha256": digest.hexdigest()}
 
-    def damage(self, noted: Mapping[str, Any]) -> str | None:
-        """Describe how the files differ from an earlier :meth:`fingerprint`, None if not at all.
+    def check(self, noted: Mapping[str, Any], advice: str) -> None:
+        """Check that the files are as they were at an earlier :meth:`fingerprint`.
 
         Args:
             noted: The fingerprint; the ``sha256`` may be missing.
+            advice: What to do if they are not.
+
+        Raises:
+            ValueError: If they have changed.
         """
         found = self.fingerprint()
-        for name, path in self._paths().items():
-            if found[name] != noted[name]:
-                return f"{path} must hold the {noted[name]} bytes written to it, got {found[name]}"
-        if found["sha256"] != noted.get("sha256", found["sha256"]):
-            return f"{self.table} and {self.details} must hold what was written, got something else"
-        return None
+        if any(found[name] != noted[name] for name in found.keys() & noted.keys()):
+            raise ValueError(
+                f"{self.table} and {self.details} must hold the {noted['table']} and "
+                f"{noted['details']} bytes written to them, got {found['table']} and "
+                f"{found['details']} bytes or other contents: {advice}"
+            )
 
     def cut_to(self, noted: Mapping[str, Any]) -> None:
         """Drop everything that was written after a :meth:`fingerprint`, even half a line.
@@ -175,9 +179,7 @@ class ItemFiles:
         for name, path in self._paths().items():
             if path.exists() and path.stat().st_size > noted[name]:
                 os.truncate(path, noted[name])
-        damage = self.damage(noted)
-        if damage:
-            raise ValueError(f"{damage}: restore it, or {self.advice}")
+        self.check(noted, f"restore them, or {self.advice}")
 
     def _paths(self) -> dict[str, Path]:
         return {"table": self.table, "details": self.details}
@@ -226,9 +228,7 @@ class ItemFiles:
                 f"{self.done} must be of {steps} steps of seeds {list(seeds)}, "
                 f"got {done['steps']} of {done['seeds']}"
             )
-        damage = self.damage(done)
-        if damage:
-            raise ValueError(f"{damage}: {_ADVICE}")
+        self.check(done, _ADVICE)
         return done
 
 
