@@ -16,10 +16,12 @@ from sb3_flowpolicy.experiments.experiment import (
     NOT_REPRODUCED,
     PARTLY,
     REPRODUCED,
+    Agent,
     Check,
     Experiment,
     Finding,
     NotMeasuredError,
+    Setting,
 )
 from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, read_settings
 
@@ -121,6 +123,16 @@ class Evidence:
         """Whether there is anything of this agent on this setting."""
         return (setting, agent) in self._logs
 
+    @property
+    def measured(self) -> list[tuple[Setting, Agent]]:
+        """All settings and agents of which there is anything."""
+        return [
+            (setting, agent)
+            for setting in self.experiment.settings
+            for agent in self.experiment.agents
+            if self.has(setting.name, agent.name)
+        ]
+
     def columns(self, setting: str, agent: str) -> list[str]:
         """Return the metrics that were measured for every seed of this agent."""
         if not self.has(setting, agent):
@@ -205,7 +217,7 @@ class Evidence:
 
     def _best_test_return(self, setting: str) -> float:
         """Return the highest test return of any agent, the unit of swings in return."""
-        agents = [one.name for one in self.experiment.agents if self.has(setting, one.name)]
+        agents = [agent.name for one, agent in self.measured if one.name == setting]
         return max(float(self.curves(setting, one, "test_return")[1].max()) for one in agents)
 
     def profile(self, setting: str, agent: str) -> tuple[np.ndarray, np.ndarray] | None:

@@ -49,18 +49,18 @@ def color(agent: Agent) -> str:
 
 def panels(evidence: Evidence) -> list[str]:
     """Return the metrics to draw: those measured, and the entropy coefficient if learned."""
-    measured: set[str] = set()
-    moves = False
-    for setting in evidence.experiment.settings:
-        for agent in evidence.experiment.agents:
-            columns = evidence.columns(setting.name, agent.name)
-            measured |= set(columns)
-            if "ent_coef" in columns:
-                moves |= bool(np.ptp(evidence.curves(setting.name, agent.name, "ent_coef")[1]) > 0)
-    extra = sorted(measured - set(PANELS) - {"train_success"})
-    return [
-        name for name in (*PANELS, *extra) if name in measured and (name != "ent_coef" or moves)
+    columns = {
+        (setting.name, agent.name): evidence.columns(setting.name, agent.name)
+        for setting, agent in evidence.measured
+    }
+    names = {name for measured in columns.values() for name in measured}
+    coefficients = [
+        evidence.curves(*pair, "ent_coef")[1] for pair in columns if "ent_coef" in columns[pair]
     ]
+    if not any(np.ptp(curves) > 0 for curves in coefficients):
+        names.discard("ent_coef")
+    extra = sorted(names - set(PANELS) - {"train_success"})
+    return [name for name in (*PANELS, *extra) if name in names]
 
 
 def curves_figure(evidence: Evidence) -> Figure:

@@ -70,11 +70,7 @@ class Section:
     def __init__(self, evidence: Evidence) -> None:
         self.evidence, self.experiment = evidence, evidence.experiment
         self.verdict, self.findings = evidence.judge()
-        self.measured = any(
-            evidence.has(setting.name, agent.name)
-            for setting in self.experiment.settings
-            for agent in self.experiment.agents
-        )
+        self.measured = bool(evidence.measured)
         self.table: Table | None = results_table(evidence) if self.measured else None
         self.facts = facts(evidence)
         self.missing = what_is_missing(self.experiment)

@@ -48,13 +48,7 @@ _METRICS = ("train_return", "train_success", "test_return", "test_success", "ent
 
 def results_table(evidence: Evidence) -> Table:
     """Return final values of every agent on every setting, with counts of seeds that solved it."""
-    experiment = evidence.experiment
-    measured = [
-        (setting, agent)
-        for setting in experiment.settings
-        for agent in experiment.agents
-        if evidence.has(setting.name, agent.name)
-    ]
+    measured = evidence.measured
     known = {name for s, a in measured for name in evidence.columns(s.name, a.name)}
     metrics = [name for name in (*_METRICS, *sorted(known - set(_METRICS))) if name in known]
     counted = "test_success" in known
