@@ -12,10 +12,6 @@ from dataclasses import dataclass, field
 Work = Callable[[], float]
 
 
-class UnavailableError(Exception):
-    """Raised by a candidate that cannot run here; its message becomes a note in the table."""
-
-
 @dataclass(frozen=True)
 class Candidate:
     """Something whose rate is measured.
@@ -23,7 +19,8 @@ class Candidate:
     Args:
         name: Label in the table.
         prepare: Builds everything and returns the work to be timed. Preparation and the first
-            piece of work are the warm-up: compile and fill buffers there.
+            piece of work are the warm-up: compile and fill buffers there. If it needs a package
+            that is not installed, the table says so.
         limit: Name of the candidate of the same benchmark that does the unavoidable work only.
     """
 
@@ -92,7 +89,7 @@ def measure(
         try:
             work = candidate.prepare()
             work()
-        except UnavailableError as reason:
+        except ModuleNotFoundError as reason:
             timing.note = str(reason)
         else:
             timing.warm_up_seconds = clock() - start

@@ -18,7 +18,7 @@ from torch import nn
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, stock_block, zoo_block
-from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, UnavailableError, Work
+from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
 from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.policies import FlowPolicy
 from sb3_flowpolicy.seeds.setup import refuse
@@ -85,11 +85,7 @@ def _single_seed(shape: Shape, policies: Sequence[str]) -> Benchmark:
         return lambda: updates_of(model(*args, **kwargs))
 
     def sbx() -> Work:
-        try:
-            sbx_sac = import_module("sbx").SAC
-        except ModuleNotFoundError as error:
-            raise UnavailableError("sbx-rl is not installed") from error
-        return updates_of(model(sbx_sac, "MlpPolicy", "MlpPolicy"))
+        return updates_of(model(import_module("sbx").SAC, "MlpPolicy", "MlpPolicy"))
 
     def limit(policy: str) -> Work:
         return products_alone([model(SACFlow, policy, policy).policy], BATCH_SIZE, N_UPDATES)

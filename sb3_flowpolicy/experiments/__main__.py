@@ -7,6 +7,7 @@ import contextlib
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from sb3_flowpolicy.common.command_line import HelpFormatter, at_least
@@ -128,66 +129,48 @@ def _parser() -> argparse.ArgumentParser:
         "trains the agents, `report` draws and judges the results.",
     )
     commands = parser.add_subparsers(required=True, metavar="list|run|report")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    for name, function, text in (
-        ("list", _list, "show all experiments, their cost and whether they can run here"),
-        ("run", _run, "run one experiment, or continue it after an interruption"),
-        ("report", _report, "write one HTML page from all results, and the tables for the docs"),
-    ):
+
+    def add_command(name: str, function: Callable, text: str) -> argparse.ArgumentParser:
+        description = text[0].upper() + text[1:] + "."
         command = commands.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            formatter_class=HelpFormatter,
+            name, help=text, description=description, formatter_class=HelpFormatter
         )
         command.set_defaults(command=function)
+        return command
+
+    show = add_command(
+        "list", _list, "show all experiments, their cost and whether they can run here"
+    )
+    run = add_command("run", _run, "run one experiment, or continue it after an interruption")
+    add, count = run.add_argument, at_least(1)
+    add("name", metavar="NAME", help="experiment; `list` shows them")
+    seeds = f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})"
+    add("--seeds", type=count, help=seeds)
+    first = "1 for results, 100 for tuning"
+    add("--first-seed", type=at_least(0), default=FIRST_SEED, help=first)
+    steps = f"steps per seed (default: the experiment's; quick: {QUICK_STEPS})"
+    add("--steps", type=count, help=steps)
+    add("--backend", choices=("local", "ray"), default="local", help="where to run")
+    add("--address", help="Ray cluster to join, 'auto' for the one this machine is in")
+    outs = " or ".join(map(str, OUT.values()))
+    add("--out", type=Path, help=f"folder for results (default: {outs}, by profile)")
+    together = "seeds trained together in a process; fewer spread over more machines"
+    add("--seeds-per-item", type=count, default=SEEDS_PER_ITEM, help=together)
+    add("--no-progress", action="store_true", help="show no progress bars")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    for command in (show, run):
         add = command.add_argument
-        if name == "run":
-            add("name", metavar="NAME", help="experiment; `list` shows them")
-            add(
-                "--seeds",
-                type=at_least(1),
-                help=f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})",
-            )
-            add(
-                "--first-seed",
-                type=at_least(0),
-                default=FIRST_SEED,
-                help="1 for results, 100 for tuning",
-            )
-            add(
-                "--steps",
-                type=at_least(1),
-                help=f"steps per seed (default: the experiment's; quick: {QUICK_STEPS})",
-            )
-            add("--backend", choices=("local", "ray"), default="local", help="where to run")
-            add("--address", help="Ray cluster to join, 'auto' for the one this machine is in")
-            outs = " or ".join(map(str, OUT.values()))
-            add("--out", type=Path, help=f"folder for results (default: {outs}, by profile)")
-            add(
-                "--seeds-per-item",
-                type=at_least(1),
-                default=SEEDS_PER_ITEM,
-                help="seeds trained together in a process; fewer spread over more machines",
-            )
-            add("--no-progress", action="store_true", help="show no progress bars")
-        if name in ("list", "run"):
-            add(
-                "--profile",
-                choices=("full", "quick"),
-                default="full",
-                help="quick: two seeds and few steps, to check that everything works",
-            )
-            add(
-                "--workers",
-                type=at_least(1),
-                default=cores,
-                help="processes at a time, one core each",
-            )
-        if name == "report":
-            add("--results", type=Path, default=OUT["full"], help="folder that `run` wrote")
-            add("--html", type=Path, help="page to write (default: report.html in it)")
-            add("--docs", type=Path, help="also write Markdown, PNG figures and data there")
+        quick = "quick: two seeds and few steps, to check that everything works"
+        add("--profile", choices=("full", "quick"), default="full", help=quick)
+        workers = "processes at a time, one core each"
+        add("--workers", type=count, default=cores, help=workers)
+    report = add_command(
+        "report", _report, "write one HTML page from all results, and the tables for the docs"
+    )
+    add = report.add_argument
+    add("--results", type=Path, default=OUT["full"], help="folder that `run` wrote")
+    add("--html", type=Path, help="page to write (default: report.html in it)")
+    add("--docs", type=Path, help="also write Markdown, PNG figures and data there")
     return parser
 
 

@@ -32,15 +32,9 @@ def write_report(results: Path, page: Path) -> Path:
 
     Raises:
         ValueError: If there are no results, or a file is corrupt.
-        ModuleNotFoundError: If plotly is missing.
     """
-    try:
-        from plotly.offline import get_plotlyjs
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            'the report needs plotly: pip install "sb3_flowpolicy[experiments]"'
-        ) from error
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
 
     loader = PackageLoader("sb3_flowpolicy.experiments", package_path="")
     templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 from sb3_flowpolicy.benchmarks import report
-from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Timing, UnavailableError, Work
+from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Timing, Work
 
 
 def nothing() -> Work:
-    raise UnavailableError("never prepared here")
+    raise ModuleNotFoundError("never prepared here")
 
 
 BENCHMARK = Benchmark(

@@ -8,7 +8,6 @@ from sb3_flowpolicy.benchmarks.timing import (
     Benchmark,
     Candidate,
     Timing,
-    UnavailableError,
     Work,
     measure,
 )
@@ -81,7 +80,7 @@ def test_ratio_is_taken_within_rounds() -> None:
 
 def test_an_unavailable_candidate_leaves_a_note() -> None:
     def prepare() -> Work:
-        raise UnavailableError("not installed")
+        raise ModuleNotFoundError("not installed")
 
     clock = FakeClock()
     candidates = [Candidate("absent", prepare), clock.candidate("A", lambda _: 1.0)]
