@@ -157,7 +157,8 @@ class Evidence:
         end = log.groupby("seed")["step"].max().min()
         curves = log.pivot(index="step", columns="seed", values=metric)
         curves = curves.interpolate(method="index").bfill().loc[:end]
-        return curves.index.to_numpy(), curves.to_numpy().T
+        # A copy has its seeds in rows: the order of summation, and so the last digit, depends on it.
+        return curves.index.to_numpy(), curves.to_numpy().T.copy()
 
     def final(self, setting: str, agent: str, metric: str) -> np.ndarray:
         """Return each seed's mean over the last tenth of its evaluations, (S,)."""
