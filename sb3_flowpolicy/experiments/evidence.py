@@ -157,7 +157,7 @@ class Evidence:
         end = log.groupby("seed")["step"].max().min()
         curves = log.pivot(index="step", columns="seed", values=metric)
         curves = curves.interpolate(method="index").bfill().loc[:end]
-        # A copy has its seeds in rows: the order of summation, and so the last digit, depends on it.
+        # A copy has its seeds in rows, so that sums over steps keep their order and last digit.
         return curves.index.to_numpy(), curves.to_numpy().T.copy()
 
     def final(self, setting: str, agent: str, metric: str) -> np.ndarray:
