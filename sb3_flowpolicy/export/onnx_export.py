@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -21,7 +22,7 @@ from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.export.deployed import DeployedPolicy, expected_actions, random_inputs
 from sb3_flowpolicy.policies import FlowActor
 
-FORMAT = "sb3_flowpolicy.onnx.2"
+FORMAT = "sb3_flowpolicy.onnx.1"
 #: Largest accepted difference to ``predict``, relative to the range of the actions.
 TOLERANCE = 1e-5
 _N_CHECKED = 64
@@ -141,8 +142,8 @@ def _add_metadata(
         "policy": type(policy).__name__,
         "distribution": policy.distribution,
         "num_timesteps": model.num_timesteps,
-        "observation_space": str(model.observation_space),
-        "action_space": str(model.action_space),
+        "observation_space": describe_space(model.observation_space),
+        "action_space": describe_space(model.action_space),
         "vec_normalize": "inside" if normalized else "none",
         "made_with": made_with(),
     }
@@ -155,6 +156,34 @@ def _add_metadata(
     for key, value in facts.items():
         entry = proto.metadata_props.add()
         entry.key, entry.value = key, value if isinstance(value, str) else json.dumps(value)
+
+
+def describe_space(space: spaces.Space) -> dict[str, Any]:
+    """Describe a space in JSON; bounds that are all equal become one number.
+
+    Example:
+        >>> describe_space(spaces.Box(-1, 1, (2,)))
+        {'type': 'Box', 'dtype': 'float32', 'shape': [2], 'low': -1.0, 'high': 1.0}
+    """
+    if isinstance(space, spaces.Dict):
+        entries = {key: describe_space(part) for key, part in space.spaces.items()}
+        return {"type": "Dict", "spaces": entries}
+    facts: dict[str, Any] = {
+        "type": type(space).__name__,
+        "dtype": str(space.dtype),
+        "shape": list(space.shape or ()),
+    }
+    if isinstance(space, spaces.Box):
+        facts.update(low=_bounds(space.low), high=_bounds(space.high))
+    sizes = {"n", "nvec"} & vars(space).keys()
+    return {**facts, **{name: np.asarray(getattr(space, name)).tolist() for name in sizes}}
+
+
+def _bounds(bounds: np.ndarray) -> Any:
+    same = bounds.size > 0 and (bounds == bounds.flat[0]).all()
+    # JSON has no infinity.
+    words = np.where(np.isfinite(bounds), bounds.astype(object), bounds.astype(str))
+    return words.flat[0] if same else words.tolist()
 
 
 def _check(
