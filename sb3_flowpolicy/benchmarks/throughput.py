@@ -31,7 +31,8 @@ Measure the speed of sb3_flowpolicy and of its baselines on this machine.
 
   updates       gradient updates per second (batch 256): SACFlow and ten stacked seeds against
                 SB3's SAC (and SBX where installed) and against the matrix products alone
-  learn         environment steps per second of learn() on TunnelDiagonal-v0
+  learn         environment steps per second of learn(): SACFlow on TunnelDiagonal-v0 and PPOFlow
+                on Pendulum-v1 against SB3's
   environments  steps per second of the environments, single and in batches of 64
   trust         calls of predict per second in each deterministic_mode, 64 actions to choose from
   flow          RealNVP forward and backward against zuko's

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -82,11 +82,11 @@ class PPOEngine:
         self.adam = FlatAdam(self.flat, [policy.optimizer])
         self.settings = _settings(model)
         device = self.flat.data.device
-        update = make_ppo_update(policy, self.flat, self.settings)
-        self._update = Compiled(update, "the PPO update", device)
+        self._eager_update = make_ppo_update(policy, self.flat, self.settings)
+        self._update = Compiled(self._eager_update, "the PPO update", device)
         act = policy_function(policy, self.flat, "sample_and_score")
         self._act = Compiled(act, "the policy", device)
-        self.compiled = compiled
+        self._update.broken = self._act.broken = not compiled
 
     def fits(self) -> bool:
         """Whether the model still has the same policy, optimizer and constants."""
@@ -121,8 +121,8 @@ class PPOEngine:
         if deterministic:
             return type(self.policy).forward(self.policy, obs, deterministic)
         noise = self.policy.draw_noise(len(obs))
-        function = self._act if self.compiled else _eager(self._act)
-        actions, values, log_prob = function((obs.shape, obs.dtype), self.flat.data, obs, noise)
+        key = (obs.shape, obs.dtype)
+        actions, values, log_prob = self._act(key, self.flat.data, obs, noise)
         check_finite(actions.cpu().numpy())
         return actions, values, log_prob
 
@@ -161,7 +161,7 @@ class PPOEngine:
                     print(f"Early stopping at step {epoch} due to reaching max kl: {kl:.2f}")
                 break
         columns = th.stack(found).T.cpu()
-        check_finite(columns[-1].numpy() / columns[-1].numpy(), "log-probabilities")
+        check_finite(np.where(columns[-1], 0.0, np.nan), "log-probabilities")
         losses = dict(zip(PPO_LOSSES, columns.tolist(), strict=False))
         losses["approx_kl"] = losses["approx_kl"][start_of_epoch:]
         return losses
@@ -173,12 +173,7 @@ class PPOEngine:
         if self.settings.ent_coef:
             noise = self.policy.draw_entropy_noise(len(samples.actions))
         batch = PPOBatch(*samples[:6], noise)
-        function = self._update
         # The rest of a rollout that does not fill a minibatch is not worth a graph of its own.
-        if not self.compiled or len(samples.actions) != self.model.batch_size:
-            function = _eager(function)
-        return function(len(samples.actions), state, batch, scalars)
-
-
-def _eager(compiled: Compiled) -> Any:
-    return lambda key, *arguments: compiled.function(*arguments)
+        if len(samples.actions) < self.model.batch_size:
+            return self._eager_update(state, batch, scalars)
+        return self._update(len(samples.actions), state, batch, scalars)
