@@ -204,7 +204,7 @@ def test_the_page_works_offline_in_a_browser(make_up: MakeUp, tmp_path: Path) ->
                 f"--window-size={width},30000",
                 # A busy machine may else run out of virtual time before the first frame.
                 "--run-all-compositor-stages-before-draw",
-                "--virtual-time-budget=30000",
+                "--virtual-time-budget=120000",
                 "--dump-dom",
                 page.as_uri(),
             ],
