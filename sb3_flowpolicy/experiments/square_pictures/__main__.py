@@ -1,0 +1,97 @@
+"""`python -m sb3_flowpolicy.experiments.square_pictures`: do the fingers move together?"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sb3_flowpolicy.common.command_line import at_least, run
+
+_DESCRIPTION = """\
+Draw how trained agents explore a task of the Square, side by side, a column per model:
+
+  together.png     sampled targets of all fingers at one state, colored by the right finger's, and
+                   paths of the square: shows in one look whether the fingers move together
+  correlation.png  absolute correlation of the eight actions (thesis Fig. 3.17); a chessboard means
+                   that all x move together, and all y
+  sequence.png     the first seven steps after the warm-up, with an arrow from the mean to each
+                   target that was taken (thesis Fig. 3.19)
+  film.webp        one episode of each agent from a second before the end of the warm-up
+
+Titles tell each model's seed and steps of training. In the episode of film, sequence, and targets,
+the warm-up is deterministic, so that the agents start to explore from similar states; the paths and
+correlations are those of further episodes, sampled from the start. Measuring does not depend on
+other models: the same model and --seed give the same column."""
+_EPILOG = """\
+example:
+  square_pictures --env SquareMoveX-v1 --model NF=flow.zip --model Gauss=gauss.zip -o pictures
+after `python -m sb3_flowpolicy.experiments.`; models are saved by `SACFlow.save`,
+`python -m sb3_flowpolicy.seeds`, or rl_zoo3. Three models take about half a minute."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.experiments.square_pictures",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add(
+        "--model",
+        metavar="LABEL=FILE",
+        type=_labeled,
+        action="append",
+        required=True,
+        help="name and zip file of an agent; once per agent",
+    )
+    add("--env", default="SquareMoveX-v1", help="task (default: %(default)s)")
+    add("-o", "--output", type=Path, default=Path("pictures"), help="folder (default: pictures)")
+    add("--seed", type=at_least(0), default=0, help="of the episodes (default: 0)")
+    add("--samples", type=at_least(2), default=300, help="actions per state (default: 300)")
+    add("--episodes", type=at_least(1), default=20, help="paths of the square (default: 20)")
+    args = parser.parse_args(arguments)
+
+    from sb3_flowpolicy.experiments.square_pictures import figures
+    from sb3_flowpolicy.experiments.square_pictures.film import write_film
+    from sb3_flowpolicy.experiments.square_pictures.record import load_agent, record
+
+    # All models are checked before the first is played.
+    agents = [(label, load_agent(path, args.env)) for label, path in args.model]
+    recordings = [
+        record(label, model, args.env, args.seed, args.samples, args.episodes)
+        for label, model in agents
+    ]
+    args.output.mkdir(parents=True, exist_ok=True)
+    for name, draw in (
+        ("together", figures.together_figure),
+        ("correlation", figures.correlation_figure),
+        ("sequence", figures.sequence_figure),
+    ):
+        draw(recordings).savefig(args.output / f"{name}.png", dpi=110)
+    write_film(recordings, args.output / "film.webp")
+    for recording in recordings:
+        index = np.arange(len(recording.correlation))
+        same = (index[:, None] + index) % 2 == 0
+        same[index, index] = False
+        print(
+            f"{recording.label} ({recording.origin}): mean |correlation| along the same axis "
+            f"{recording.correlation[same].mean():.2f}, lost {recording.dropped.sum()} of "
+            f"{len(recording.dropped)} squares"
+        )
+    print(f"Pictures and film: {args.output}")
+
+
+def _labeled(text: str) -> tuple[str, Path]:
+    label, found, path = text.partition("=")
+    if not (label and found and path):
+        raise argparse.ArgumentTypeError(f"must be LABEL=FILE, such as NF=flow.zip, got {text!r}")
+    return label, Path(path)
+
+
+if __name__ == "__main__":
+    run(main)

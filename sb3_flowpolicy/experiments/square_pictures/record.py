@@ -1,0 +1,198 @@
+"""What the pictures show: sampled targets, correlations and paths of one trained agent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+
+from flowpolicy_envs.square.env import SquareEnv
+from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.experiments.measures import own_random_numbers
+from sb3_flowpolicy.policies import FlowActor
+
+FILM_LEAD = 4
+"""Steps of the warm-up that a film shows: one second."""
+FILM_SIZE = 256
+CORRELATION_STATES, CORRELATION_SAMPLES = 64, 1024
+
+
+class Moment(NamedTuple):
+    """A state of the Square and the policy's targets there, in world units.
+
+    Attributes:
+        body: x, y and angle of the square, (3,).
+        half: Half the edge of the square.
+        fingers: Positions of the fingers: right, top, left, bottom, (4, 2).
+        starts: Centers of the boxes that the fingers reach, (4, 2).
+        reach: Half the edge of these boxes.
+        samples: Targets of N sampled actions, (N, 4, 2).
+        chosen: Targets of the action that was taken, itself sampled, (4, 2).
+    """
+
+    body: np.ndarray
+    half: float
+    fingers: np.ndarray
+    starts: np.ndarray
+    reach: float
+    samples: np.ndarray
+    chosen: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of the sampled targets, (4, 2)."""
+        return self.samples.mean(0)
+
+
+class Recording(NamedTuple):
+    """What one agent did.
+
+    Attributes:
+        label: Name of the agent.
+        origin: Its seed and steps of training.
+        moments: Steps of one episode after the warm-up, until it ended.
+        frames: Pictures of the same episode from a second before, (size, size, 3) each.
+        paths: x of the square after the warm-up in E sampled episodes of up to T steps, NaN
+            once they have ended, (E, T).
+        dropped: In which of them the square fell or a finger broke, (E,).
+        correlation: Mean absolute correlation of the actions given the state, over states of these
+            episodes after the warm-up, (8, 8).
+    """
+
+    label: str
+    origin: str
+    moments: list[Moment]
+    frames: list[np.ndarray]
+    paths: np.ndarray
+    dropped: np.ndarray
+    correlation: np.ndarray
+
+
+def load_agent(path: Path, env_id: str) -> SACFlow:
+    """Load a model for a task of the Square.
+
+    Raises:
+        ValueError: If the task is not one of the Square, or the model has another policy, or was
+            trained with other observations or actions.
+    """
+    env = gym.make(env_id)
+    if not isinstance(env.unwrapped, SquareEnv):
+        raise ValueError(f"env must be a task of the Square, such as SquareMoveX-v1, got {env_id}")
+    model = SACFlow.load(path, device="cpu")
+    if not isinstance(model.actor, FlowActor):
+        raise ValueError(
+            f"{path} must hold a policy of sb3_flowpolicy, got {type(model.policy).__name__}"
+        )
+    spaces = (model.observation_space, model.action_space)
+    if spaces != (env.observation_space, env.action_space):
+        raise ValueError(f"{path} must hold a model for {env_id}, got one for {spaces}")
+    return model
+
+
+def record(
+    label: str, model: SACFlow, env_id: str, seed: int, n_samples: int, n_episodes: int
+) -> Recording:
+    """Play the episodes that the pictures show.
+
+    The first is deterministic during the warm-up, so that all agents start to explore from a
+    similar state, and sampled afterwards. The others are sampled from the start.
+
+    Args:
+        label: Name of the agent.
+        model: From :func:`load_agent`.
+        env_id: Task.
+        seed: Of the first episode; those for the paths follow.
+        n_samples: Sampled actions per moment, at least 2.
+        n_episodes: Number of episodes for the paths and the correlation, at least 1.
+
+    Raises:
+        ValueError: If the agent breaks a finger in the warm-up of the first episode, or in that of
+            all others.
+    """
+    kind = "tuning seed" if model.seed is not None and model.seed >= 100 else "seed"
+    origin = f"{kind} {model.seed}, {model.num_timesteps:,} steps"
+    with own_random_numbers(seed, 0):
+        moments, frames = _episode(model, env_id, seed, n_samples)
+    with own_random_numbers(seed, 1) as rng:
+        paths, dropped, states = _paths(model, env_id, seed + 1, n_episodes)
+        if not moments or not len(states):
+            raise ValueError(f"{label} must get through the warm-up, but breaks a finger before")
+        chosen = rng.choice(len(states), min(CORRELATION_STATES, len(states)), replace=False)
+        obs = th.as_tensor(states[chosen])
+        assert isinstance(model.actor, FlowActor)
+        correlation = model.actor.action_correlation(obs, CORRELATION_SAMPLES).abs().mean(0)
+    return Recording(label, origin, moments, frames, paths, dropped, correlation.numpy())
+
+
+def _episode(
+    model: SACFlow, env_id: str, seed: int, n_samples: int
+) -> tuple[list[Moment], list[np.ndarray]]:
+    env = gym.make(env_id, render_mode="rgb_array", render_size=FILM_SIZE)
+    square: Any = env.unwrapped
+    warm = int(square.config.warm_steps)
+    obs, _ = env.reset(seed=seed)
+    moments, frames = [], []
+    step, done = 0, False
+    while not done:
+        samples, _ = model.predict(np.repeat(obs[None], n_samples, axis=0))
+        action, _ = model.predict(obs, deterministic=step < warm)
+        if step >= warm:
+            moments.append(_moment(square.get_state(), samples, action))
+        if step >= warm - FILM_LEAD:
+            square.set_action_samples(samples)
+            frames.append(_frame(env))
+        obs, _, terminated, truncated, _ = env.step(action)
+        done, step = terminated or truncated, step + 1
+    square.set_action_samples(None)
+    frames.append(_frame(env))
+    env.close()
+    return moments, frames
+
+
+def _frame(env: gym.Env) -> np.ndarray:
+    frame: Any = env.render()
+    return frame
+
+
+def _moment(state: dict[str, Any], samples: np.ndarray, action: np.ndarray) -> Moment:
+    from flowpolicy_envs.square import kernels
+
+    starts, reach = state["starts"], float(state["constants"][kernels.REACH])
+    return Moment(
+        body=state["bodies"][:3],
+        half=float(state["constants"][kernels.HALF_SIDE]),
+        fingers=state["fingers"],
+        starts=starts,
+        reach=reach,
+        samples=starts + reach * samples.reshape(-1, 4, 2),
+        chosen=starts + reach * action.reshape(4, 2),
+    )
+
+
+def _paths(
+    model: SACFlow, env_id: str, first_seed: int, n_episodes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Play sampled episodes side by side: paths (E, T), which dropped (E,), and states (S, O)."""
+    envs = [gym.make(env_id) for _ in range(n_episodes)]
+    squares: list[Any] = [env.unwrapped for env in envs]
+    warm = int(squares[0].config.warm_steps)
+    obs = np.stack([env.reset(seed=first_seed + k)[0] for k, env in enumerate(envs)])
+    running, dropped = np.ones(n_episodes, bool), np.zeros(n_episodes, bool)
+    rows: list[np.ndarray] = []
+    states: list[np.ndarray] = []
+    step = 0
+    while running.any():
+        if step >= warm:
+            x = [square.get_state()["bodies"][0] for square in squares]
+            rows.append(np.where(running, x, np.nan))
+            states.extend(obs[running].copy())
+        actions, _ = model.predict(obs)
+        for k in np.flatnonzero(running):
+            obs[k], _, terminated, truncated, _ = envs[k].step(actions[k])
+            dropped[k], running[k] = terminated, not (terminated or truncated)
+        step += 1
+    paths = np.array(rows).reshape(-1, n_episodes).T
+    return paths, dropped, np.array(states)
