@@ -13,18 +13,19 @@ from sb3_flowpolicy.common.command_line import at_least, run
 _DESCRIPTION = """\
 Draw how trained agents explore a task of the Square, side by side, a column per model:
 
-  together.png     sampled targets of all fingers at one state, colored by the right finger's, and
-                   paths of the square: shows in one look whether the fingers move together
+  together.png     sampled targets of each finger at one state, colored by what the other fingers do
+                   in the same sample, and paths of the square: do the fingers move together?
   correlation.png  absolute correlation of the eight actions (thesis Fig. 3.17); a chessboard means
                    that all x move together, and all y
   sequence.png     the first seven steps after the warm-up, with an arrow from the mean to each
                    target that was taken (thesis Fig. 3.19)
   film.webp        one episode of each agent from a second before the end of the warm-up
 
-Titles tell each model's seed and steps of training. In the episode of film, sequence, and targets,
-the warm-up is deterministic, so that the agents start to explore from similar states; the paths and
-correlations are those of further episodes, sampled from the start. Measuring does not depend on
-other models: the same model and --seed give the same column."""
+Titles tell each model's seed and steps of training. Film, sequence, and
+targets show the first of ten episodes in which the agent does not lose the square (if it loses all,
+the first); its warm-up is deterministic, so that the agents start to explore from similar states.
+Paths and correlations are those of further episodes, sampled from the start and shown whatever
+their end. The same model and --seed give the same column, whatever the other models are."""
 _EPILOG = """\
 example:
   square_pictures --env SquareMoveX-v1 --model NF=flow.zip --model Gauss=gauss.zip -o pictures
@@ -52,7 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--env", default="SquareMoveX-v1", help="task (default: %(default)s)")
     add("-o", "--output", type=Path, default=Path("pictures"), help="folder (default: pictures)")
     add("--seed", type=at_least(0), default=0, help="of the episodes (default: 0)")
-    add("--samples", type=at_least(2), default=300, help="actions per state (default: 300)")
     add("--episodes", type=at_least(1), default=20, help="paths of the square (default: 20)")
     args = parser.parse_args(arguments)
 
@@ -63,8 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # All models are checked before the first is played.
     agents = [(label, load_agent(path, args.env)) for label, path in args.model]
     recordings = [
-        record(label, model, args.env, args.seed, args.samples, args.episodes)
-        for label, model in agents
+        record(label, model, args.env, args.seed, args.episodes) for label, model in agents
     ]
     args.output.mkdir(parents=True, exist_ok=True)
     for name, draw in (
@@ -72,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ("correlation", figures.correlation_figure),
         ("sequence", figures.sequence_figure),
     ):
-        draw(recordings).savefig(args.output / f"{name}.png", dpi=110)
+        figures.save(draw(recordings), args.output / f"{name}.png")
     write_film(recordings, args.output / "film.webp")
     for recording in recordings:
         index = np.arange(len(recording.correlation))

@@ -16,7 +16,7 @@ _HEAD = 20
 
 
 def write_film(recordings: Sequence[Recording], path: Path) -> None:
-    """Write the agents' episodes as one animated WebP in real time, which browsers show as an image.
+    """Write the agents' episodes as an animated WebP in real time, an image for browsers.
 
     An episode that ends early rests on its last frame.
     """
@@ -30,7 +30,7 @@ def write_film(recordings: Sequence[Recording], path: Path) -> None:
         picture.paste(Image.fromarray(np.hstack(row)), (0, _HEAD))
         for column, recording in enumerate(recordings):
             label = f"{recording.label}: {recording.origin}"
-            ImageDraw.Draw(picture).text((size * column + 6, 4), label, "black")
+            ImageDraw.Draw(picture).text((size * column + 6, 4), label, "black", font_size=13)
         pictures.append(picture)
     with replacing(path) as draft:
         pictures[0].save(

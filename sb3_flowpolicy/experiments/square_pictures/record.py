@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.env import SquareEnv
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.experiments.measures import own_random_numbers
@@ -17,6 +18,10 @@ from sb3_flowpolicy.policies import FlowActor
 FILM_LEAD = 4
 """Steps of the warm-up that a film shows: one second."""
 FILM_SIZE = 256
+ATTEMPTS = 10
+"""Episodes among which the one that is shown step by step is found."""
+N_SAMPLES, N_SHOWN = 1300, 300
+"""Sampled actions per state; all but those shown serve to find how the fingers move together."""
 CORRELATION_STATES, CORRELATION_SAMPLES = 64, 1024
 
 
@@ -46,6 +51,25 @@ class Moment(NamedTuple):
         """Mean of the sampled targets, (4, 2)."""
         return self.samples.mean(0)
 
+    def joint_movement(self) -> tuple[np.ndarray, np.ndarray]:
+        """Find the movement that the fingers share most, and each finger's part in it.
+
+        It is the first principal component of the correlation matrix of all samples that are not
+        shown, so that chance patterns of those that are shown have no part in it.
+
+        Returns:
+            own: Along it, each finger's own component in the N_SHOWN samples, (N_SHOWN, 4).
+            others: Sum of the other three fingers' components, (N_SHOWN, 4). Independent fingers
+                have no correlation of own and others.
+        """
+        fitted = self.samples[N_SHOWN:].reshape(-1, 8)
+        # A target that never changes has no part in any movement.
+        scale = np.maximum(fitted.std(0), np.finfo(np.float32).eps)
+        unit = (self.samples.reshape(-1, 8) - fitted.mean(0)) / scale
+        first = np.linalg.eigh(unit[N_SHOWN:].T @ unit[N_SHOWN:])[1][:, -1]
+        own = (unit[:N_SHOWN] * first).reshape(-1, 4, 2).sum(2)
+        return own, own.sum(1, keepdims=True) - own
+
 
 class Recording(NamedTuple):
     """What one agent did.
@@ -53,7 +77,7 @@ class Recording(NamedTuple):
     Attributes:
         label: Name of the agent.
         origin: Its seed and steps of training.
-        moments: Steps of one episode after the warm-up, until it ended.
+        moments: Steps of one episode after the warm-up.
         frames: Pictures of the same episode from a second before, (size, size, 3) each.
         paths: x of the square after the warm-up in E sampled episodes of up to T steps, NaN
             once they have ended, (E, T).
@@ -92,64 +116,68 @@ def load_agent(path: Path, env_id: str) -> SACFlow:
     return model
 
 
-def record(
-    label: str, model: SACFlow, env_id: str, seed: int, n_samples: int, n_episodes: int
-) -> Recording:
+def record(label: str, model: SACFlow, env_id: str, seed: int, n_episodes: int) -> Recording:
     """Play the episodes that the pictures show.
 
-    The first is deterministic during the warm-up, so that all agents start to explore from a
-    similar state, and sampled afterwards. The others are sampled from the start.
+    The episode that is shown step by step is the first of ``ATTEMPTS`` in which the square is not
+    lost, else the first of all. It is deterministic during the warm-up, so that all agents start to
+    explore from similar states, and sampled afterwards. Those for paths and correlation are all
+    kept, whatever their end, and sampled from the start.
 
     Args:
         label: Name of the agent.
         model: From :func:`load_agent`.
         env_id: Task.
-        seed: Of the first episode; those for the paths follow.
-        n_samples: Sampled actions per moment, at least 2.
+        seed: Of the first episode; the others follow.
         n_episodes: Number of episodes for the paths and the correlation, at least 1.
 
     Raises:
-        ValueError: If the agent breaks a finger in the warm-up of the first episode, or in that of
-            all others.
+        ValueError: If the agent always breaks a finger before the end of the warm-up.
     """
     kind = "tuning seed" if model.seed is not None and model.seed >= 100 else "seed"
     origin = f"{kind} {model.seed}, {model.num_timesteps:,} steps"
     with own_random_numbers(seed, 0):
-        moments, frames = _episode(model, env_id, seed, n_samples)
+        episodes: list[tuple[list[Moment], list[np.ndarray]]] = []
+        for k in range(ATTEMPTS):
+            moments, frames, lost = _episode(model, env_id, seed + k)
+            if moments:
+                episodes.insert(len(episodes) if lost else 0, (moments, frames))
+            if not lost:
+                break
     with own_random_numbers(seed, 1) as rng:
-        paths, dropped, states = _paths(model, env_id, seed + 1, n_episodes)
-        if not moments or not len(states):
+        paths, dropped, states = _paths(model, env_id, seed + ATTEMPTS, n_episodes)
+        if not episodes or not len(states):
             raise ValueError(f"{label} must get through the warm-up, but breaks a finger before")
         chosen = rng.choice(len(states), min(CORRELATION_STATES, len(states)), replace=False)
         obs = th.as_tensor(states[chosen])
         assert isinstance(model.actor, FlowActor)
         correlation = model.actor.action_correlation(obs, CORRELATION_SAMPLES).abs().mean(0)
+    moments, frames = episodes[0]
     return Recording(label, origin, moments, frames, paths, dropped, correlation.numpy())
 
 
-def _episode(
-    model: SACFlow, env_id: str, seed: int, n_samples: int
-) -> tuple[list[Moment], list[np.ndarray]]:
+def _episode(model: SACFlow, env_id: str, seed: int) -> tuple[list[Moment], list[np.ndarray], bool]:
+    """Return what is drawn of one episode, and whether the square was lost."""
     env = gym.make(env_id, render_mode="rgb_array", render_size=FILM_SIZE)
     square: Any = env.unwrapped
     warm = int(square.config.warm_steps)
     obs, _ = env.reset(seed=seed)
     moments, frames = [], []
-    step, done = 0, False
-    while not done:
-        samples, _ = model.predict(np.repeat(obs[None], n_samples, axis=0))
+    step, terminated, truncated = 0, False, False
+    while not (terminated or truncated):
+        samples, _ = model.predict(np.repeat(obs[None], N_SAMPLES, axis=0))
         action, _ = model.predict(obs, deterministic=step < warm)
         if step >= warm:
             moments.append(_moment(square.get_state(), samples, action))
         if step >= warm - FILM_LEAD:
-            square.set_action_samples(samples)
+            square.set_action_samples(samples[:N_SHOWN])
             frames.append(_frame(env))
         obs, _, terminated, truncated, _ = env.step(action)
-        done, step = terminated or truncated, step + 1
+        step += 1
     square.set_action_samples(None)
     frames.append(_frame(env))
     env.close()
-    return moments, frames
+    return moments, frames, terminated
 
 
 def _frame(env: gym.Env) -> np.ndarray:
@@ -158,8 +186,6 @@ def _frame(env: gym.Env) -> np.ndarray:
 
 
 def _moment(state: dict[str, Any], samples: np.ndarray, action: np.ndarray) -> Moment:
-    from flowpolicy_envs.square import kernels
-
     starts, reach = state["starts"], float(state["constants"][kernels.REACH])
     return Moment(
         body=state["bodies"][:3],
