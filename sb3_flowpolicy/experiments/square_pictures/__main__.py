@@ -6,8 +6,6 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from sb3_flowpolicy.common.command_line import at_least, run
 
 _DESCRIPTION = """\
@@ -24,8 +22,9 @@ Draw how trained agents explore a task of the Square, side by side, a column per
 Titles tell each model's seed and steps of training. Film, sequence, and
 targets show the first of ten episodes in which the agent does not lose the square (if it loses all,
 the first); its warm-up is deterministic, so that the agents start to explore from similar states.
-Paths and correlations are those of further episodes, sampled from the start and shown whatever
-their end. The same model and --seed give the same column, whatever the other models are."""
+Paths, correlations, and the numbers printed are those of further episodes, sampled from the start
+and kept whatever their end. The same model, --seed, and --episodes give the same column, whatever
+the other models are."""
 _EPILOG = """\
 example:
   square_pictures --env SquareMoveX-v1 --model NF=flow.zip --model Gauss=gauss.zip -o pictures
@@ -74,13 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         figures.save(draw(recordings), args.output / f"{name}.png")
     write_film(recordings, args.output / "film.webp")
     for recording in recordings:
-        index = np.arange(len(recording.correlation))
-        same = (index[:, None] + index) % 2 == 0
-        same[index, index] = False
         print(
-            f"{recording.label} ({recording.origin}): mean |correlation| along the same axis "
-            f"{recording.correlation[same].mean():.2f}, lost {recording.dropped.sum()} of "
-            f"{len(recording.dropped)} squares"
+            f"{recording.label} ({recording.origin}): entropy {recording.entropy:.1f} nats, x std "
+            f"{recording.x_std:.3f}, lost {recording.dropped.sum()} of {len(recording.dropped)} "
+            "squares"
         )
     print(f"Pictures and film: {args.output}")
 

@@ -161,9 +161,7 @@ def _draw_paths(axes: Axes, recording: Recording) -> None:
         if dropped and len(reached):
             last = reached[-1]
             axes.plot(seconds[last], path[last], "x", color=_RIGHT, markersize=5)
-    after = [path[~np.isnan(path)] for path in recording.paths]
-    spread = np.mean([path.std() for path in after if len(path)])
-    axes.set_title(f"standard deviation of x {spread:.3f}", fontsize=8)
+    axes.set_title(f"standard deviation of x {recording.x_std:.3f}", fontsize=8)
     axes.set_xlabel("seconds after the warm-up", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.25, linewidth=0.5)

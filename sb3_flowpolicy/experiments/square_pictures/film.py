@@ -40,4 +40,5 @@ def write_film(recordings: Sequence[Recording], path: Path) -> None:
             duration=round(1000 / RENDER_FPS),
             loop=0,
             quality=60,
+            method=6,  # slow and small
         )

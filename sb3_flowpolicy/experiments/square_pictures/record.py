@@ -22,7 +22,7 @@ ATTEMPTS = 10
 """Episodes among which the one that is shown step by step is found."""
 N_SAMPLES, N_SHOWN = 1300, 300
 """Sampled actions per state; all but those shown serve to find how the fingers move together."""
-CORRELATION_STATES, CORRELATION_SAMPLES = 64, 1024
+MEASURED_STATES, MEASURED_SAMPLES = 256, 1024
 
 
 class Moment(NamedTuple):
@@ -84,6 +84,7 @@ class Recording(NamedTuple):
         dropped: In which of them the square fell or a finger broke, (E,).
         correlation: Mean absolute correlation of the actions given the state, over states of these
             episodes after the warm-up, (8, 8).
+        entropy: Mean entropy of the squashed policy over the same states, nats.
     """
 
     label: str
@@ -93,6 +94,13 @@ class Recording(NamedTuple):
     paths: np.ndarray
     dropped: np.ndarray
     correlation: np.ndarray
+    entropy: float
+
+    @property
+    def x_std(self) -> float:
+        """Mean over the episodes of the standard deviation of x after the warm-up."""
+        reached = [path[~np.isnan(path)] for path in self.paths]
+        return float(np.mean([path.std() for path in reached if len(path)]))
 
 
 def load_agent(path: Path, env_id: str) -> SACFlow:
@@ -148,12 +156,13 @@ def record(label: str, model: SACFlow, env_id: str, seed: int, n_episodes: int) 
         paths, dropped, states = _paths(model, env_id, seed + ATTEMPTS, n_episodes)
         if not episodes or not len(states):
             raise ValueError(f"{label} must get through the warm-up, but breaks a finger before")
-        chosen = rng.choice(len(states), min(CORRELATION_STATES, len(states)), replace=False)
+        chosen = rng.choice(len(states), min(MEASURED_STATES, len(states)), replace=False)
         obs = th.as_tensor(states[chosen])
         assert isinstance(model.actor, FlowActor)
-        correlation = model.actor.action_correlation(obs, CORRELATION_SAMPLES).abs().mean(0)
+        correlation = model.actor.action_correlation(obs, MEASURED_SAMPLES).abs().mean(0)
+        entropy = model.actor.entropy(obs, MEASURED_SAMPLES).mean().item()
     moments, frames = episodes[0]
-    return Recording(label, origin, moments, frames, paths, dropped, correlation.numpy())
+    return Recording(label, origin, moments, frames, paths, dropped, correlation.numpy(), entropy)
 
 
 def _episode(model: SACFlow, env_id: str, seed: int) -> tuple[list[Moment], list[np.ndarray], bool]:
