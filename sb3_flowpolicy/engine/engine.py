@@ -9,7 +9,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
-from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, took_equal_steps
+from sb3_flowpolicy.engine.adam import FlatAdam, why_optimizer_unsupported
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
@@ -56,12 +56,9 @@ def why_unsupported(model: SAC) -> str | None:
         if not parameter.requires_grad or parameter._backward_hooks:
             return "parameters that are frozen or have hooks"
     for optimizer in (policy.actor.optimizer, policy.critic.optimizer):
-        if adam_settings(optimizer) is None:
-            return f"optimizer of type {type(optimizer).__name__} with these settings"
-        if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
-            return "optimizer with hooks"
-        if not took_equal_steps(optimizer):
-            return "optimizer of which a part was reset"
+        reason = why_optimizer_unsupported(optimizer)
+        if reason is not None:
+            return reason
     return None
 
 

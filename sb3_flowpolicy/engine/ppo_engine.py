@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
-from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, took_equal_steps
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, why_optimizer_unsupported
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.engine import MODE_DEPENDENT
 from sb3_flowpolicy.engine.flat import FlatParameters
@@ -30,7 +30,7 @@ from sb3_flowpolicy.policies.on_policy import DensityActorCritic
 
 def why_ppo_unsupported(model: PPO) -> str | None:
     """Return what about a model the engine does not support; None if it supports everything."""
-    policy, optimizer = model.policy, model.policy.optimizer
+    policy = model.policy
     if not isinstance(policy, DensityActorCritic):
         return f"policy of type {type(policy).__name__}"
     if type(model.rollout_buffer) is not RolloutBuffer:
@@ -41,13 +41,7 @@ def why_ppo_unsupported(model: PPO) -> str | None:
     for parameter in policy.parameters():
         if not parameter.requires_grad or parameter._backward_hooks:
             return "parameters that are frozen or have hooks"
-    if adam_settings(optimizer) is None:
-        return f"optimizer of type {type(optimizer).__name__} with these settings"
-    if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
-        return "optimizer with hooks"
-    if not took_equal_steps(optimizer):
-        return "optimizer of which a part was reset"
-    return None
+    return why_optimizer_unsupported(policy.optimizer)
 
 
 def _settings(model: PPO) -> PPOSettings:
