@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -25,6 +24,8 @@ from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_c
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import (
     Check,
+    by_name,
+    check_policy,
     check_settings,
     either,
     entropy_coefficient,
@@ -106,14 +107,9 @@ class OffPolicyFlow(OffPolicyAlgorithm):
         action_noise_correlation_time: float | None = None,
         **kwargs: Any,
     ) -> None:
-        names_of_args = inspect.signature(self.stock).parameters
-        given = {**dict(zip(names_of_args, args, strict=False)), **kwargs}
+        given = by_name(self.stock, args, kwargs)
         check_settings(given, self.settings)
-        policy, kind, names = given.get("policy"), self.policy_class_of_stock, self.policy_aliases
-        if not (issubclass(policy, kind) if isinstance(policy, type) else policy in names):
-            raise ValueError(
-                f"policy must be one of {list(names)} or a {kind.__name__}, got {policy!r}"
-            )
+        check_policy(given.get("policy"), self.policy_class_of_stock, self.policy_aliases)
         self.action_noise_color = action_noise_color
         self.action_noise_correlation_time = action_noise_correlation_time
         self._exploration = ColoredExploration()

@@ -7,15 +7,45 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 from stable_baselines3 import PPO
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_flowpolicy.common.validation import either, flag
+from sb3_flowpolicy.common.validation import (
+    Check,
+    by_name,
+    check_policy,
+    check_settings,
+    either,
+    flag,
+    integer,
+    number,
+    optional,
+    or_infinity,
+    or_schedule,
+)
 from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
 from sb3_flowpolicy.engine.ppo_engine import PPOEngine, why_ppo_unsupported
 from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy
+
+_SETTINGS: dict[str, Check] = {
+    "n_steps": integer(1),
+    "batch_size": integer(1),
+    "n_epochs": integer(1),
+    "gamma": number(0, 1),
+    "gae_lambda": number(0, 1),
+    "clip_range": or_schedule(number(0, above=True)),
+    "clip_range_vf": optional(or_schedule(number(0, above=True))),
+    "normalize_advantage": flag,
+    "ent_coef": number(0),
+    "vf_coef": number(0),
+    "max_grad_norm": or_infinity(number(0, above=True)),
+    "target_kl": optional(number(0, above=True)),
+    "stats_window_size": integer(1),
+    "seed": optional(integer(0, 2**32 - 1)),
+    "compile": either("auto", flag),
+}
 
 
 class PPOFlow(PPO):
@@ -36,6 +66,9 @@ class PPOFlow(PPO):
         **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that
             successive actions are independent.
 
+    Raises:
+        ValueError: If an argument is out of range.
+
     References:
         Proximal Policy Optimization Algorithms (Schulman et al., 2017).
 
@@ -46,7 +79,10 @@ class PPOFlow(PPO):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = on_policy.ALIASES
 
     def __init__(self, *args: Any, compile: bool | Literal["auto"] = "auto", **kwargs: Any) -> None:
-        self.compile: bool | Literal["auto"] = either("auto", flag)("compile", compile)
+        given = by_name(PPO, args, kwargs)
+        check_settings({**given, "compile": compile}, _SETTINGS)
+        check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
+        self.compile: bool | Literal["auto"] = compile
         self._planned_updates = 0
         self._engine: PPOEngine | None = None
         super().__init__(*args, **kwargs)

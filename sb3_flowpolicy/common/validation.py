@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -104,6 +105,11 @@ def or_schedule(check: Check) -> Check:
     return _or(check, callable, "a function")
 
 
+def or_infinity(check: Check) -> Check:
+    """Accept infinity, too."""
+    return lambda name, value: value if value == math.inf else check(name, value)
+
+
 def is_number(value: Any) -> bool:
     """Whether this is a real number that floats can hold: no boolean, no array."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
@@ -168,3 +174,31 @@ def check_settings(settings: Mapping[str, Any], table: Mapping[str, Check]) -> N
     for name, check in {**table, **_FURTHER}.items():
         if name in settings:
             check(name, settings[name])
+
+
+def by_name(algorithm: type, args: Iterable[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the positional and keyword arguments of a constructor by name.
+
+    Example:
+        >>> from stable_baselines3 import SAC
+        >>> by_name(SAC, ["MlpPolicy", "Pendulum-v1"], {"gamma": 0.9})
+        {'policy': 'MlpPolicy', 'env': 'Pendulum-v1', 'gamma': 0.9}
+    """
+    return {**dict(zip(inspect.signature(algorithm).parameters, args, strict=False)), **kwargs}
+
+
+def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
+    """Check that a policy is one of an algorithm's names, or a class of its kind.
+
+    Example:
+        >>> from stable_baselines3.sac.policies import SACPolicy
+        >>> from sb3_flowpolicy import FlowTQCPolicy
+        >>> check_policy(FlowTQCPolicy, SACPolicy, ["FlowPolicy"])
+        Traceback (most recent call last):
+        ...
+        ValueError: policy must be one of ['FlowPolicy'] or a SACPolicy, got FlowTQCPolicy
+    """
+    known = list(names)
+    if not (issubclass(policy, base) if isinstance(policy, type) else policy in known):
+        name = getattr(policy, "__name__", repr(policy))
+        raise ValueError(f"policy must be one of {known} or a {base.__name__}, got {name}")

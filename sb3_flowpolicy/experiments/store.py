@@ -200,13 +200,25 @@ class ItemFiles:
             return pd.DataFrame(columns=list(BASIC_COLUMNS))
         text = io.StringIO("".join(lines))
         try:
-            return pd.read_csv(text, dtype=np.float64, float_precision="round_trip")
+            table = pd.read_csv(text, dtype=np.float64, float_precision="round_trip")
+            basic = table.reindex(columns=["seed", "step"])
+            if not {*basic} <= {*table} or not np.isfinite(basic.to_numpy()).all():
+                raise ValueError("a row lacks its seed or step")
+            return table
         except ValueError as error:
             raise ValueError(f"{self.table} must hold numbers: {error}; {_ADVICE}") from error
 
     def read_details(self) -> list[dict[str, Any]]:
-        """Return what :meth:`append_detail` wrote, up to the last whole line."""
-        return [json.loads(line) for line in _whole_lines(self.details)]
+        """Return what :meth:`append_detail` wrote, up to the last whole line.
+
+        Raises:
+            ValueError: If a line is corrupt.
+        """
+        lines = _whole_lines(self.details)
+        try:
+            return [json.loads(line) for line in lines]
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{self.details} must hold JSON: {error}; {_ADVICE}") from error
 
     def read_done(self, steps: int, seeds: Sequence[int]) -> dict[str, Any] | None:
         """Return the facts of a finished item, None of an unfinished one.
@@ -248,7 +260,9 @@ def _format(value: float | None) -> str:
 
 def _whole_lines(path: Path) -> list[str]:
     """Return the lines of a file without the last if it is being written or was interrupted."""
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    if not path.exists():
+        return []
+    lines = path.read_text(errors="replace").splitlines(keepends=True)
     return [line for line in lines if line.endswith("\n")]
 
 

@@ -75,7 +75,7 @@ def test_names_of_policies(algorithm: Any) -> None:
         if name.startswith(("Cnn", "MultiInput")):
             continue
         assert type(algorithm(name, ENV, device="cpu", **settings).policy) is policy
-    with pytest.raises(ValueError, match="NoPolicy"):
+    with pytest.raises(ValueError, match=r"must be one of .*'LowRankPolicy'.* got 'NoPolicy'"):
         algorithm("NoPolicy", ENV)
 
 
@@ -95,8 +95,8 @@ def test_on_policy_algorithms_have_no_colored_noise() -> None:
         ({"policy": "stock", "action_noise_color": 1.0}, "one of sb3_flowpolicy's"),
         ({"ent_coef": -1.0}, "ent_coef must be at least 0, got -1.0"),
         ({"learning_rate": -1.0}, "learning_rate must be a function or at least 0, got -1.0"),
-        ({"policy": FlowPolicy}, "policy must be one of .* got .*FlowPolicy"),
-        ({"policy": FlowActorCriticPolicy}, "policy must be one of .* got .*FlowActorCriticPolicy"),
+        ({"policy": FlowPolicy}, "policy must be one of .* got FlowPolicy"),
+        ({"policy": FlowActorCriticPolicy}, "policy must be one of .* got FlowActorCriticPolicy"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics must be an integer of at least 1, got 0"),
     ],
 )
@@ -116,8 +116,33 @@ def test_bad_arguments_of_one_algorithm() -> None:
         make(TQCFlow, top_quantiles_to_drop_per_net=1.5)
     with pytest.raises(ValueError, match="n_quantiles must be an integer of at least 1, got 0"):
         make(TQCFlow, policy_kwargs={"n_quantiles": 0})
+    with pytest.raises(ValueError, match="batch_norm_momentum must be at most 1, got 5"):
+        make(CrossQFlow, policy_kwargs={"batch_norm_momentum": 5})
+    with pytest.raises(ValueError, match="renorm_warmup_steps must be an integer of at least 0"):
+        make(CrossQFlow, policy_kwargs={"renorm_warmup_steps": -5})
     with pytest.raises(ValueError, match="policy_delay must be an integer of at least 1, got 0"):
         make(CrossQFlow, policy_delay=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"n_steps": 2.5}, "n_steps must be an integer of at least 1, got 2.5"),
+        ({"n_epochs": 0}, "n_epochs must be an integer of at least 1, got 0"),
+        ({"gamma": 2}, "gamma must be at most 1, got 2"),
+        ({"clip_range": 0.0}, "clip_range must be a function or above 0, got 0.0"),
+        ({"clip_range_vf": "a"}, "clip_range_vf must be None or a function or a number, got 'a'"),
+        ({"target_kl": -1.0}, "target_kl must be None or above 0, got -1.0"),
+        ({"ent_coef": "auto"}, "ent_coef must be a number, got 'auto'"),
+        ({"learning_rate": "a"}, "learning_rate must be a function or a number, got 'a'"),
+        ({"seed": "a"}, "seed must be None or an integer"),
+        ({"policy_kwargs": 5}, "policy_kwargs must be None or a dict"),
+        ({"policy": TQC.policy_aliases["MlpPolicy"]}, "policy must be one of .* got TQCPolicy"),
+    ],
+)
+def test_bad_arguments_of_ppo(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PPOFlow(**{"policy": "FlowPolicy", "env": ENV, "n_steps": 32, **arguments})
 
 
 def test_ppo_leaves_what_sb3_refuses_to_sb3() -> None:

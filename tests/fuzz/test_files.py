@@ -17,6 +17,7 @@ from hypothesis.extra import numpy as npst
 
 from sb3_flowpolicy.algorithms.demonstrations import KEYS, load_demonstrations
 from sb3_flowpolicy.common.files import read_json
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles
 from tests.bundle.mutations import by_chance
 from tests.fuzz.effort import fuzz
 from tests.fuzz.test_configuration import ANYTHING, works_or_says_why
@@ -107,6 +108,22 @@ def test_arrays_that_promise_more_than_they_have_are_refused(tmp_path: Path) -> 
             archive.writestr(f"{key}.npy", member.getvalue())
     with pytest.raises(ValueError, match=r"an \.npz file of arrays of numbers, got"):
         load_demonstrations(path)
+
+
+@fuzz(300)
+@given(
+    table=st.binary(max_size=80)
+    | st.text(alphabet="0123456789.,-+einfa\n\r\"' \u2028\x0b\x00", max_size=80).map(str.encode),
+    head=st.booleans(),
+)
+def test_result_tables(tmp_path: Path, table: bytes, head: bool) -> None:
+    files = ItemFiles(tmp_path, "item")
+    files.table.write_bytes((",".join(BASIC_COLUMNS).encode() + b"\n") * head + table)
+    files.details.write_bytes(table)
+    rows = works_or_says_why(files.read_table)
+    assert rows is None or np.isfinite(rows["step"].astype(float)).all()
+    details = works_or_says_why(files.read_details)
+    assert details is None or isinstance(details, list)
 
 
 @fuzz(300)
