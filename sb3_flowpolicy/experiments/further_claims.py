@@ -13,7 +13,7 @@ from sb3_flowpolicy.experiments.experiment import (
 )
 
 _GAUSS_AND_FLOW = (GAUSS, FLOW)
-_SQUARE_STEPS, _SQUARE_SEEDS = 100_000, 5
+_SQUARE_STEPS, _SQUARE_SEEDS = 60_000, 5
 
 
 def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:

@@ -5,7 +5,9 @@ from flowpolicy_envs import FindGoal, Hold, Move, SquareEnv, SquareVectorEnv
 NAN = float("nan")
 
 BAD = [
-    ({"task": "juggle"}, r"task must be a Task or one of .*'hold', .*, got 'juggle'"),
+    ({"task": "juggle"}, r"task must be a Task, one of .*'hold', .*, got 'juggle'"),
+    ({"task": {"angle": 1.0}}, r"or a mapping with such a name, got {'angle': 1.0}"),
+    ({"task": {"name": "move", "angle": -1.0}}, "angle must"),
     ({"mass": 0.0}, r"mass must be positive, got 0.0"),
     ({"mass": [0.3, 0.2]}, r"mass must be a finite number or \[low, high\], got \[0.3, 0.2\]"),
     ({"mass": [0.1, 0.2, 0.3]}, r"mass must be a finite number or \[low, high\]"),

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -62,7 +63,7 @@ class SquareConfig:
         ValueError: mass must be positive, got -1.0
     """
 
-    task: Task | str = "hold"
+    task: Task | str | Mapping[str, Any] = "hold"
     size: Range = 0.6
     mass: Range = 0.2
     inertia: Range = 0.012

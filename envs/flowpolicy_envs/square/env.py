@@ -66,7 +66,8 @@ class SquareEnv(BatchEnv):
     ## Rewards
 
     The tasks `Hold`, `Move`, `MoveX`, `FindGoal` in `flowpolicy_envs.square.tasks` have the
-    coefficients below as arguments. Per step, with defaults:
+    coefficients below as arguments; `"hold"`, `"move"`, `"move_x"`, and `"find_goal"` have the
+    defaults, and `{"name": "move_x", "angle": 0.3}` changes some. Per step, with defaults:
 
     | Term | `Hold` | `Move` | `MoveX` | `FindGoal` |
     |------|------|------|-------|----------|
@@ -110,7 +111,7 @@ class SquareEnv(BatchEnv):
 
     | Argument | Default | Range | Meaning |
     |----------|---------|-------|---------|
-    | `task` | `"hold"` | a `Task`, or `"hold"`, `"move"`, `"move_x"`, `"find_goal"` | the reward |
+    | `task` | `"hold"` | a `Task`, a name, or a mapping, see above | the reward |
     | `size` | 0.6 | positive, interval | edge of the square, world units |
     | `mass` | 0.2 | positive, interval | $m$, kg |
     | `inertia` | 0.012 | positive, interval | $I$, kg per unit² |
@@ -158,7 +159,8 @@ class SquareEnv(BatchEnv):
 
     * v1 (all ids but `Square`): `friction_cone`, `slew` of 0.25 s, stiffer fingers (`kp` 50, `kd`
       0.5) and `friction` 1.25, so that independent noise breaks the grip and joint motion does
-      not; moving: `weight` 7.5, `linear_damping` 1; holding: `weight` 11.5, `max_force` 3
+      not; moving: `weight` 7.5, `linear_damping` 1, a penalty of the angle of 0.3 per radian;
+      holding: `weight` 11.5, `max_force` 3
     * v0: Initial version
     """
 
@@ -166,7 +168,7 @@ class SquareEnv(BatchEnv):
 
     def __init__(
         self,
-        task: Task | str = "hold",
+        task: Task | str | Mapping[str, Any] = "hold",
         *,
         render_mode: str | None = None,
         render_size: int = 600,

@@ -1,6 +1,8 @@
 """The tasks, whose arguments are the coefficients of the reward."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,18 +151,30 @@ TASKS: dict[str, type[Task]] = {
 """Names of the tasks with default coefficients, for YAML files for example."""
 
 
-def as_task(task: "Task | str") -> Task:
-    """Return the task itself or the task of this name.
+def as_task(task: "Task | str | Mapping[str, Any]") -> Task:
+    """Return the task itself, the task of this name, or the one that a mapping describes.
+
+    Args:
+        task: A task, one of the names in `TASKS`, or a mapping with a `name` and coefficients, as
+            YAML files have it.
 
     Raises:
-        ValueError: If it is neither a task nor the name of a task.
+        ValueError: If it is none of these, or a coefficient is out of its range.
+        TypeError: If the task has no such coefficient.
 
     Example:
         >>> as_task("move_x")
         MoveX(held=1.0, failure=10.0, angle=0.0, effort=0.05, position=0.5, y=0.5)
+        >>> as_task({"name": "move_x", "angle": 0.3}).angle
+        0.3
     """
     if isinstance(task, Task):
         return task
-    if not isinstance(task, str) or task not in TASKS:
-        raise ValueError(f"task must be a Task or one of {tuple(TASKS)}, got {task!r}")
-    return TASKS[task]()
+    coefficients = dict(task) if isinstance(task, Mapping) else {"name": task}
+    name = coefficients.pop("name", None)
+    if not isinstance(name, str) or name not in TASKS:
+        raise ValueError(
+            f"task must be a Task, one of {tuple(TASKS)}, or a mapping with such a name, "
+            f"got {task!r}"
+        )
+    return TASKS[name](**coefficients)
