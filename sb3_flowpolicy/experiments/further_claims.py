@@ -113,7 +113,7 @@ FURTHER_CLAIMS = (
         ),
         steps=1_000_000,
         seeds=3,
-        eval_every=20_000,
+        eval_every=4000,
         measures=("same_axis_correlation", "x_std", "x_max"),
         notes="In the thesis the agents differ after about 1.5 million steps.",
     ),

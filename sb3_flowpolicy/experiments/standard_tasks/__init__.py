@@ -1,0 +1,1 @@
+"""Are our policies worse than stock on standard tasks?"""

@@ -1,0 +1,100 @@
+"""Every candidate is trained with the published settings, no run twice, and judged by the rule."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import rl_zoo3
+import yaml
+from stable_baselines3.common.utils import LinearSchedule
+from torch import nn
+
+from sb3_flowpolicy.experiments.standard_tasks import __main__ as command
+from sb3_flowpolicy.experiments.standard_tasks import rule, tasks, training
+
+_OF_GSDE = ("use_sde", "sde_sample_freq", "use_expln", "log_std_init")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    few: Any = {"learning_starts": 20, "batch_size": 16, "buffer_size": 200}
+    few |= {"policy_kwargs": {"net_arch": [8]}}
+    rollout = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "normalize": True}
+    settings = {"sac": few, "tqc": few, "crossq": few, "ppo": rollout}
+    task = tasks.TASKS["tunnel-2"]._replace(steps=dict.fromkeys(settings, 100), settings=settings)
+    monkeypatch.setitem(tasks.TASKS, "tunnel-2", task)
+    monkeypatch.setattr(training, "_TESTS", 2)
+
+
+@pytest.mark.usefixtures("quick")
+def test_runs_are_recorded_and_not_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "table.csv"
+    options = ["--task", "tunnel-2", "--episodes", "1", "--csv", str(path), "--seeds", "3"]
+    command.main([*options, "--algorithms", "tqc", "ppo", "--policies", "stock", "flow"])
+    table = pd.read_csv(path)
+    runs = set(table[["algorithm", "policy"]].itertuples(index=False, name=None))
+    assert runs == {(algorithm, name) for algorithm in ("tqc", "ppo") for name in ("stock", "flow")}
+    assert list(table["step"][:4]) == [50, 100, 50, 100]
+    assert table["test_success"].between(0, 1).all()
+    assert "| tunnel-2 | ppo | flow |" in capsys.readouterr().out
+    trained = []
+    train = training.train
+    monkeypatch.setattr(training, "train", lambda *run: trained.append(run[1:4]) or train(*run))
+    figure = tmp_path / "curves.png"
+    command.main([*options, "--algorithms", "ppo", "--figure", str(figure)])
+    assert trained == [("ppo", name, 3) for name in ("gauss", "lowrank", "full")]
+    assert figure.stat().st_size > 10_000
+
+
+def test_mistakes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(tmp_path / "table.csv")
+    for options, message in (
+        (["--csv", path], "--csv must name files with results"),
+        (["--csv", path, "--task", "tunnel-2", "--algorithms", "tqc"], "no settings of tqc"),
+        (["--csv", path, "--task", "tunnel-2", "--policies", "bent"], "stock, gauss, .* got bent"),
+    ):
+        with pytest.raises(SystemExit):
+            command.main(options)
+        assert re.search(message, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("name", ["half-cheetah", "hopper", "walker"])
+@pytest.mark.parametrize("algorithm", ["sac", "tqc", "crossq", "ppo"])
+def test_settings_are_those_of_rl_zoo3_without_gsde(name: str, algorithm: str) -> None:
+    file = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algorithm}.yml"
+    task = tasks.TASKS[name]
+    published = yaml.safe_load(file.read_text())[task.env_id]
+    published["policy_kwargs"] = eval(published["policy_kwargs"], {"nn": nn, "dict": dict})
+    for settings in (published, published["policy_kwargs"]):
+        for unused in (*_OF_GSDE, "policy", "n_timesteps"):
+            settings.pop(unused, None)
+    ours = {"policy_kwargs": {}, **task.settings[algorithm]}
+    for key, value in ours.items():
+        if isinstance(value, LinearSchedule):
+            assert published[key] == f"lin_{value.start:g}".replace("0.00073", "7.3e-4")
+            published[key] = value
+    assert ours == published
+
+
+def test_the_rule_tells_worse_from_not_worse() -> None:
+    stock = np.array([100.0, 101.0, 99.0, 100.0])
+    for scale, expected in ((0.9, "worse"), (1.0, "surely not worse"), (1.1, "better")):
+        assert rule.verdict(rule.difference(scale * stock, stock)) == expected
+    wide = np.array([60.0, 130.0, 80.0, 120.0])
+    assert rule.verdict(rule.difference(wide, stock)) == "not worse"
+    # Of negative returns the less negative ones are better.
+    assert rule.verdict(rule.difference(-1.1 * stock, -stock)) == "worse"
+
+
+def test_final_values_are_successes_where_there_is_a_goal() -> None:
+    rows = [("a", "ppo", "flow", 1, step, 5.0 * step, np.nan) for step in (1, 2, 3)]
+    rows += [("b", "ppo", "flow", 1, step, 9.0, 0.1 * step) for step in (1, 2, 3)]
+    names = ["task", "algorithm", "policy", "seed", "step", "test_return", "test_success"]
+    assert rule.finals(pd.DataFrame(rows, columns=names)).tolist() == [12.5, 0.25]
