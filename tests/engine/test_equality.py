@@ -147,7 +147,6 @@ def test_eager_engine_equals_sb3(
 
 
 COMPILED = [
-    ("MlpPolicy", 2.5e-4, "auto", th.float32),
     ("LowRankPolicy", 2.5e-4, "auto", th.float32),
     ("FlowPolicy", 2.5e-4, "auto", th.float32),
     ("FlowPolicy", 0.0, 0.1, th.float64),

@@ -51,7 +51,7 @@ def train(task: Task, algorithm: str, name: str, seed: int, episodes: int) -> li
     # One call, because schedules follow the progress of a call.
     steps = task.steps[algorithm]
     model.learn(steps, callback=EveryNTimesteps(max(1, steps // _TESTS), tests))
-    if not tests.rows or tests.rows[-1][0] < model.num_timesteps:
+    if len(tests.rows) < _TESTS:
         tests.test(model)
     venv.close()
     test_venv.close()
