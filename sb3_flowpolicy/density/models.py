@@ -55,7 +55,7 @@ class OurRealNVP(FlowModel):
 
     def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
         """See :class:`FlowModel`."""
-        return self.flow.rsample_and_log_prob(self._context(condition), noise)[0]
+        return self.flow.rsample(self._context(condition), noise)
 
     def _context(self, condition: th.Tensor) -> th.Tensor:
         if self.encoder is None:

@@ -64,6 +64,12 @@ class ActionDistribution(nn.Module, ABC):
         _check_last_dim("noise", noise, self.noise_dim)
         return self._rsample_and_log_prob(context, noise)
 
+    def rsample(self, context: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """Return the sample of :meth:`rsample_and_log_prob` without scoring it: to act."""
+        _check_last_dim("context", context, self.context_dim)
+        _check_last_dim("noise", noise, self.noise_dim)
+        return self._rsample(context, noise)
+
     def log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
         """Return log p(u | h) in nats, shape (...), of points ``value``, shape (..., D)."""
         _check_last_dim("context", context, self.context_dim)
@@ -101,6 +107,10 @@ class ActionDistribution(nn.Module, ABC):
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]: ...
+
+    def _rsample(self, context: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        # To be overridden where the log-density takes a large part of the time.
+        return self._rsample_and_log_prob(context, noise)[0]
 
     @abstractmethod
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor: ...

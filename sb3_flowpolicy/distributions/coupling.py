@@ -88,17 +88,29 @@ class CouplingPair(nn.Module):
 
         The second result is log|det J|, shape (...), of the map from base to action side.
         """
-        if not self.in_order:
-            value = value.index_select(-1, self.order)
-        halves, ladj = list(value.split(self.sizes, dim=-1)), value.new_zeros(())
+        halves, ladj = self._split(value), value.new_zeros(())
         turns = list(enumerate(self.couplings))
         for i, coupling in reversed(turns) if inverse else turns:
             outputs = coupling(halves[i], projected[i])
             move = coupling.move_back if inverse else coupling.move
             halves[1 - i], ladjs = move(halves[1 - i], outputs)
             ladj = ladj + ladjs.sum(-1)
+        return self._join(halves), ladj
+
+    def push(self, value: th.Tensor, projected: Sequence[th.Tensor]) -> th.Tensor:
+        """Map base to action side without the log-determinant."""
+        halves = self._split(value)
+        for i, coupling in enumerate(self.couplings):
+            halves[1 - i], _ = coupling.move(halves[1 - i], coupling(halves[i], projected[i]))
+        return self._join(halves)
+
+    def _split(self, value: th.Tensor) -> list[th.Tensor]:
+        ordered = value if self.in_order else value.index_select(-1, self.order)
+        return list(ordered.split(self.sizes, dim=-1))
+
+    def _join(self, halves: list[th.Tensor]) -> th.Tensor:
         value = th.cat(halves, dim=-1)
-        return (value if self.in_order else value.index_select(-1, self.back)), ladj
+        return value if self.in_order else value.index_select(-1, self.back)
 
 
 def split_order(features: int, index: int) -> tuple[list[int], int]:
@@ -198,14 +210,26 @@ class CouplingFlow(ActionDistribution):
         self, context: th.Tensor, value: th.Tensor, log_prob: th.Tensor, inverse: bool
     ) -> tuple[th.Tensor, th.Tensor]:
         """Map ``value`` through all pairs and subtract their log-determinants from ``log_prob``."""
-        shape = th.broadcast_shapes(context.shape[:-1], value.shape[:-1])
-        value = value.expand(*shape, self.action_dim)
-        projected = list(self.context_proj(context).chunk(self.layers, dim=-1))
-        steps = [(pair, [projected.pop(0) for _ in pair.couplings]) for pair in self.pairs]
+        value, steps = self._prepare(context, value)
         for pair, share in reversed(steps) if inverse else steps:
             value, ladj = pair(value, share, inverse)
             log_prob = log_prob - ladj
         return value, log_prob
+
+    def _prepare(
+        self, context: th.Tensor, value: th.Tensor
+    ) -> tuple[th.Tensor, list[tuple[CouplingPair, list[th.Tensor]]]]:
+        """Return ``value`` with the leading dimensions of both, and each pair's share of h."""
+        shape = th.broadcast_shapes(context.shape[:-1], value.shape[:-1])
+        projected = list(self.context_proj(context).chunk(self.layers, dim=-1))
+        steps = [(pair, [projected.pop(0) for _ in pair.couplings]) for pair in self.pairs]
+        return value.expand(*shape, self.action_dim), steps
+
+    def _rsample(self, context: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        value, steps = self._prepare(context, noise)
+        for pair, share in steps:
+            value = pair.push(value, share)
+        return value
 
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor
@@ -218,4 +242,4 @@ class CouplingFlow(ActionDistribution):
 
     def _mode(self, context: th.Tensor) -> th.Tensor:
         zeros = context.new_zeros(*context.shape[:-1], self.action_dim)
-        return self._rsample_and_log_prob(context, zeros)[0]
+        return self._rsample(context, zeros)

@@ -61,6 +61,10 @@ class LocScale(DiagGaussian):
         sample, log_prob = self.shape.rsample_and_log_prob(context, noise)
         return loc + log_std.exp() * sample, log_prob - log_std.sum(-1)
 
+    def _rsample(self, context: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        loc, log_std = self.loc_and_log_std(context)
+        return loc + log_std.exp() * self.shape.rsample(context, noise)
+
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
         loc, log_std = self.loc_and_log_std(context)
         standardized = (value - loc) * (-log_std).exp()

@@ -72,11 +72,25 @@ class LowRankGaussian(DiagGaussian):
     ) -> tuple[th.Tensor, th.Tensor]:
         loc, log_std, columns = self.covariance_factors(context)
         diag_noise, factor_noise = noise.split([self.action_dim, self.rank], dim=-1)
-        sample = loc + log_std.exp() * diag_noise
-        for k, column in enumerate(columns):
-            sample = sample + column * factor_noise[..., k : k + 1]
         hidden = th.cat([diag_noise, -factor_noise], dim=-1)
+        sample = self._combine(loc, log_std, columns, noise)
         return sample, self._density(log_std, columns, hidden)
+
+    def _rsample(self, context: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        return self._combine(*self.covariance_factors(context), noise)
+
+    def _combine(
+        self,
+        loc: th.Tensor,
+        log_std: th.Tensor,
+        columns: tuple[th.Tensor, ...],
+        noise: th.Tensor,
+    ) -> th.Tensor:
+        diag_noise, *factor_noise = noise.split([self.action_dim, *[1] * self.rank], dim=-1)
+        sample = loc + log_std.exp() * diag_noise
+        for column, each in zip(columns, factor_noise, strict=True):
+            sample = sample + column * each
+        return sample
 
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
         loc, log_std, columns = self.covariance_factors(context)

@@ -44,6 +44,9 @@ class TanhSquashed(ActionDistribution):
         unsquashed, log_prob = self.base.rsample_and_log_prob(context, noise)
         return th.tanh(unsquashed), log_prob - tanh_ladj(unsquashed)
 
+    def _rsample(self, context: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        return th.tanh(self.base.rsample(context, noise))
+
     def _log_prob(self, context: th.Tensor, value: th.Tensor) -> th.Tensor:
         # The edge has no preimage. Score the largest number below it instead.
         edge = 1 - th.finfo(value.dtype).eps

@@ -59,7 +59,7 @@ class DeployedPolicy(nn.Module):
         context = self.actor.context(obs.get(ONLY_KEY, obs))
         actions = [self.actor.density.mode(context)]
         if self.stochastic:
-            actions.append(self.actor.density.rsample_and_log_prob(context, inputs[-1])[0])
+            actions.append(self.actor.density.rsample(context, inputs[-1]))
         low, span = self.get_buffer("low"), self.get_buffer("span")
         return tuple(
             (low + 0.5 * (action + 1.0) * span).unflatten(-1, self.action_shape)

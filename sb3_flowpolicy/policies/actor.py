@@ -117,9 +117,11 @@ class FlowActor(Actor):
 
         By default the noise is drawn here: standard normals, shape (batch, M).
         """
+        context = self.context(obs)
         if deterministic:
-            return self.density.mode(self.context(obs))
-        return self.action_log_prob(obs, noise)[0]
+            return self.density.mode(context)
+        noise = self.draw_noise(context) if noise is None else noise
+        return self.density.rsample(context, noise)
 
     def action_log_prob(
         self, obs: PyTorchObs, noise: th.Tensor | None = None
@@ -176,7 +178,7 @@ class FlowActor(Actor):
         """
         context = self.context(obs)
         noise = self.draw_noise(context, n_samples)
-        actions = self.density.rsample_and_log_prob(context, noise)[0].movedim(0, -1)
+        actions = self.density.rsample(context, noise).movedim(0, -1)
         centered = actions - actions.mean(-1, keepdim=True)
         # A constant dimension has correlation 0 with all others and 1 with itself.
         tiny = th.finfo(actions.dtype).tiny

@@ -167,7 +167,7 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         """Do the computation of :meth:`forward`, given noise (B, M)."""
         latent, values = self._latent_and_values(obs)
         density = self.action_dist.density
-        actions = density.rsample_and_log_prob(latent, noise)[0]
+        actions = density.rsample(latent, noise)
         log_prob = density.log_prob(latent, actions)
         return actions.reshape(-1, *(self.action_space.shape or ())), values, log_prob
 

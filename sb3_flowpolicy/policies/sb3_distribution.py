@@ -62,7 +62,7 @@ class ActionDistributionAdapter(Distribution):
 
     def sample(self) -> th.Tensor:
         """Draw a reparametrized sample, shape (batch, D)."""
-        return self.log_prob_from_params(self.context)[0]
+        return self.density.rsample(self.context, self.density.draw_noise(self.context))
 
     def mode(self) -> th.Tensor:
         """Return the deterministic action, shape (batch, D)."""
