@@ -8,7 +8,7 @@ A folder holds, per experiment, ``settings.json`` and three files per item:
 ``KEY.done.json``        written last; commit, versions, machine and time
 =======================  ======================================================================
 
-and ``checkpoints/KEY`` while the item is unfinished.
+``checkpoints/KEY`` while the item is unfinished, and then its first agent, ``agents/KEY.zip``.
 """
 
 from __future__ import annotations
@@ -123,6 +123,7 @@ class ItemFiles:
         self.details = folder / f"{key}.details.jsonl"
         self.done = folder / f"{key}.done.json"
         self.checkpoints = folder / "checkpoints" / key
+        self.agent = folder / "agents" / f"{key}.zip"
         self.advice = f"delete {self.checkpoints} and {self.table} to repeat this item"
 
     @property

@@ -139,6 +139,10 @@ class _Training:
         if "profile" in item.measures:
             self._record("profile", entropy_profile, models)
         tests.close()
+        if group == 0:
+            # To draw pictures of; before the item is declared complete.
+            self.files.agent.parent.mkdir(exist_ok=True)
+            models[0].save(self.files.agent)
         self.steps = stage
 
     def _begin(self, group: int) -> SeedBatch | SACFlow:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.checkpoint import state
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.machine import machine
@@ -67,6 +68,8 @@ def test_everything_is_measured(item: WorkItem, tmp_path: Path) -> None:
     assert done["sessions"] == 1
     assert {"commit", "versions", "processor", "date"} <= done["machine"].keys()
     assert not files.checkpoints.exists()
+    agent = SACFlow.load(files.agent)
+    assert (agent.seed, agent.num_timesteps) == (1, item.steps)
 
 
 class Crash(BaseException):
