@@ -115,9 +115,9 @@ FURTHER_CLAIMS = (
         seeds=3,
         eval_every=4000,
         measures=("same_axis_correlation", "x_std", "x_max"),
-        notes="In the thesis the agents differ after about 1.5 million steps. A million takes three "
-        "hours of a core here, so these runs are much shorter; the constants of the -v1 tasks are "
-        "such that correlation should pay earlier.",
+        notes="In the thesis the agents differ after about 1.5 million steps. A million takes "
+        "three hours of a core here, so these runs are much shorter; the constants of the -v1 "
+        "tasks are such that correlation should pay earlier.",
     ),
     Experiment(
         name="find-goal",
