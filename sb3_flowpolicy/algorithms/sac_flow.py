@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -23,23 +21,17 @@ from sb3_flowpolicy.algorithms.demonstrations import (
     is_recipe,
     load_demonstrations,
 )
-from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
-from sb3_flowpolicy.common.validation import check_settings, either, flag, integer, number, optional
-from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
-from sb3_flowpolicy.guard.finite import check_observation
+from sb3_flowpolicy.common.validation import check_settings, integer, number, optional
+from sb3_flowpolicy.engine.sac import SB3_CRITIC_LOSS_COEF, SACObjective
 from sb3_flowpolicy.policies import sac
-from sb3_flowpolicy.policies.base import check_finite
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
-
-# SB3 halves the squared error, spinningup (and the thesis) does not.
-SB3_CRITIC_LOSS_COEF = 0.5
-MOST_DRAWN_AT_ONCE = 1000
 
 SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
 
 
-class SACFlow(OffPolicyFlow, SAC):
+class SACFlow(EngineFlow, SAC):
     r"""Soft Actor-Critic with action distributions that correlate and bend.
 
     Everything of SB3's :class:`~stable_baselines3.SAC` holds: ``ent_coef=0.01`` fixes the entropy
@@ -91,11 +83,9 @@ class SACFlow(OffPolicyFlow, SAC):
     stock = SAC
     policy_class_of_stock = SACPolicy
     settings: ClassVar = {
-        **SETTINGS,
+        **EngineFlow.settings,
         "random_steps": optional(integer(0)),
         "critic_loss_coef": number(0, above=True),
-        "compile": either("auto", flag),
-        "autocast": flag,
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = sac.ALIASES
     #: Statistics of ``VecNormalize`` from a bundle that was loaded without an environment.
@@ -109,22 +99,12 @@ class SACFlow(OffPolicyFlow, SAC):
         random_steps: int | None = None,
         demonstrations: str | Path | Mapping[str, Any] | None = None,
         critic_loss_coef: float = SB3_CRITIC_LOSS_COEF,
-        compile: bool | Literal["auto"] = "auto",
-        autocast: bool = False,
         **sac_kwargs: Any,
     ) -> None:
-        own = {
-            "random_steps": random_steps,
-            "critic_loss_coef": critic_loss_coef,
-            "compile": compile,
-            "autocast": autocast,
-        }
+        own = {"random_steps": random_steps, "critic_loss_coef": critic_loss_coef}
         check_settings(own, self.settings)
         self.random_steps = random_steps
         self.critic_loss_coef = critic_loss_coef
-        self.compile: bool | Literal["auto"] = compile
-        self.autocast = autocast
-        self._runtime = EngineRuntime([self], _warn_of_sb3s_loop)
         self._demonstrations: Any = (
             demonstrations
             if demonstrations is None or is_recipe(demonstrations)
@@ -204,52 +184,6 @@ class SACFlow(OffPolicyFlow, SAC):
         """
         return load_bundle(cls, path, env, device)
 
-    def learn(
-        self, total_timesteps: int, callback: MaybeCallback = None, *args: Any, **kwargs: Any
-    ) -> SACFlow:
-        """Train; the arguments are those of :meth:`OffPolicyFlow.learn`."""
-        with self._runtime.running(watched=callback is not None):
-            return super().learn(total_timesteps, callback, *args, **kwargs)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions, as in SB3.
-
-        While the model learns with a compiled policy, callbacks such as ``EvalCallback`` act with
-        it, too, if they evaluate as many environments at once as the model learns from.
-        """
-        is_base = not deterministic or getattr(self.policy, "deterministic_mode", "base") == "base"
-        if is_base and self._runtime.is_running and isinstance(observation, np.ndarray):
-            engine = self._runtime.engine()
-            if engine is not None and engine.compiled:
-                obs, is_batch = self.policy.obs_to_tensor(observation)
-                assert isinstance(obs, th.Tensor)
-                check_observation(observation)
-                scaled = self._act_compiled(engine, obs, deterministic)
-                if scaled is not None:
-                    check_finite(scaled)
-                    actions = self.policy.unscale_action(scaled)
-                    return (actions if is_batch else actions.squeeze(axis=0)), state
-        return super().predict(observation, state, episode_start, deterministic)
-
-    def _act_compiled(
-        self, engine: Engine, obs: th.Tensor, deterministic: bool
-    ) -> np.ndarray | None:
-        """Return scaled actions, None if there is no compiled function for them."""
-        obs = obs.unsqueeze(0).contiguous()
-        if not engine.has_compiled_policy(obs):
-            return None
-        noise = None
-        if deterministic:  # the mode is the image of no noise
-            actor, shape = engine.networks.actor.data, (*obs.shape[:2], engine.networks.noise_dim)
-            noise = actor.new_zeros(shape)
-        return engine.act(obs, noise).cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
-
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.replay_buffer is None:
             raise ValueError("learn() needs a replay buffer: give env to load_safe to train on")
@@ -261,58 +195,11 @@ class SACFlow(OffPolicyFlow, SAC):
                 self._demonstrations = recorded
             self.add_demonstrations(self._demonstrations)
             self._demonstrations = None
-        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        self._runtime.plan(self._planned_updates(total_timesteps))
-        return total_timesteps, callback
+        return super()._setup_learn(*args, **kwargs)
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        random_steps = learning_starts if self.random_steps is None else self.random_steps
-        engine = None
-        if self.num_timesteps >= random_steps and self._runtime.is_running:
-            engine = self._runtime.engine()
-        if engine is None or not engine.compiled:
-            return super()._sample_action(random_steps, action_noise, n_envs)
-        # What SB3 does, without finding out again that the observation is an array.
-        obs = th.as_tensor(self._last_obs, device=self.device)
-        noise = self._exploration.next()
-        if noise is not None:
-            noise = noise.to(engine.networks.actor.data).unsqueeze(0)
-        scaled = engine.act(obs.unsqueeze(0), noise).squeeze(0).cpu().numpy()
-        return self._finish_action(scaled, action_noise, n_envs)
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Do ``gradient_steps`` updates with minibatches of ``batch_size`` transitions.
-
-        The numbers are those of SB3's ``SAC.train``. Models that the engine does not support (image
-        observations, optimizers other than Adam, ...) use SB3's own loop.
-
-        Raises:
-            NonFiniteError: If a loss is not finite; weights are then as they were when the guard
-                last checked them.
-        """
-        with self._runtime.running():
-            engine = self._runtime.engine()
-            if engine is None:
-                return self._train_with_sb3(gradient_steps, batch_size)
-            self._update_learning_rate(list(self.optimizers().values()))
-            # Minibatches are drawn for many updates at once, but not for all of an offline run.
-            for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
-                n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
-                self._guard.before_updates()
-                batches = engine.draw(n_updates, batch_size)
-                losses = engine.train(batches, start).tolist()
-                self._n_updates += n_updates
-                self._guard.after_updates(LOSSES, losses, engine.history, batches)
-                self.record_losses(losses)
-
-    def record_losses(self, losses: Sequence[Sequence[float]], seed: int = 0) -> None:
-        """Record what SB3's ``train`` records: the engine's losses, (4, S), of one seed."""
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for key, values in zip(LOSSES, losses, strict=True):
-            if key != "ent_coef_loss" or self.ent_coef_optimizer is not None:
-                self.logger.record(f"train/{key}", values[seed])
+    def objective(self) -> SACObjective:
+        """Return SAC's objective, with the present ``critic_loss_coef``."""
+        return SACObjective(self.critic_loss_coef)
 
     def _train_with_sb3(self, gradient_steps: int, batch_size: int) -> None:
         """Run SB3's loop, with the critic's gradient scaled to ``critic_loss_coef``."""
@@ -326,18 +213,10 @@ class SACFlow(OffPolicyFlow, SAC):
 
         hook = self.critic.optimizer.register_step_pre_hook(scale_gradient)
         try:
-            super().train(gradient_steps, batch_size)
+            super()._train_with_sb3(gradient_steps, batch_size)
         finally:
             hook.remove()
         self.logger.name_to_value["train/critic_loss"] *= factor
-
-    def _planned_updates(self, total_timesteps: int) -> float:
-        """Count the updates still to come; an estimate where episodes decide."""
-        steps = max(0, total_timesteps - max(self.num_timesteps, self.learning_starts))
-        if self.gradient_steps < 0:
-            return steps
-        assert isinstance(self.train_freq, TrainFreq)
-        return steps / self.env.num_envs * self.gradient_steps / self.train_freq.frequency
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """Save as SB3 does, with a ``deterministic_mode`` that was set after construction."""
@@ -345,16 +224,5 @@ class SACFlow(OffPolicyFlow, SAC):
             self.policy_kwargs = self.policy.up_to_date(self.policy_kwargs)
         super().save(path, exclude, include)
 
-    def _stateful_parts(self) -> dict[str, Any]:
-        return {**super()._stateful_parts(), "engine": self._runtime}
-
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_demonstrations", "_runtime"]
-
-
-def _warn_of_sb3s_loop(reason: str) -> None:
-    warnings.warn(
-        f"training runs SB3's own loop, which is slower: the engine does not do {reason}",
-        UserWarning,
-        stacklevel=5,
-    )
+        return [*super()._excluded_save_params(), "_demonstrations"]

@@ -8,27 +8,28 @@ from sb3_contrib import TQC
 from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.common.validation import integer
+from sb3_flowpolicy.engine.tqc import TQCObjective
 from sb3_flowpolicy.policies import tqc
 
 
-class TQCFlow(OffPolicyFlow, TQC):
+class TQCFlow(EngineFlow, TQC):
     """Truncated Quantile Critics with action distributions that correlate and bend.
 
     Supports everything that sb3-contrib's :class:`~sb3_contrib.TQC` does.
     ``action_noise_color`` and ``action_noise_correlation_time`` make exploration directed, see
     :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`; :meth:`learn` takes
-    ``checkpoint_every`` and ``checkpoint_path``. Updates are sb3-contrib's own: only
-    :class:`~sb3_flowpolicy.SACFlow` uses the fast engine.
+    ``checkpoint_every`` and ``checkpoint_path``. Updates equal sb3-contrib's number by number and
+    run on the engine, as those of :class:`~sb3_flowpolicy.SACFlow`.
 
     Args:
         policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``,
             their ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of TQC, in its order.
-        **kwargs: Keyword arguments of TQC, ``action_noise_color`` and
-            ``action_noise_correlation_time``.
+        **kwargs: Keyword arguments of TQC, and ``compile``, ``autocast``, ``action_noise_color``
+            and ``action_noise_correlation_time`` of :class:`~sb3_flowpolicy.SACFlow`.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -44,7 +45,7 @@ class TQCFlow(OffPolicyFlow, TQC):
 
     stock = TQC
     policy_class_of_stock = TQCPolicy
-    settings: ClassVar = {**SETTINGS, "top_quantiles_to_drop_per_net": integer(0)}
+    settings: ClassVar = {**EngineFlow.settings, "top_quantiles_to_drop_per_net": integer(0)}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = tqc.ALIASES
 
     def _setup_model(self) -> None:
@@ -55,3 +56,7 @@ class TQCFlow(OffPolicyFlow, TQC):
                 "top_quantiles_to_drop_per_net must be less than n_quantiles of policy_kwargs, "
                 f"got {dropped} of {quantiles}"
             )
+
+    def objective(self) -> TQCObjective:
+        """Return TQC's objective, with the present ``top_quantiles_to_drop_per_net``."""
+        return TQCObjective(self.top_quantiles_to_drop_per_net)

@@ -16,6 +16,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, stock_block, zoo_block
 from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
@@ -157,15 +158,15 @@ def prefilled(algorithm: Callable[..., Any], shape: Shape, **kwargs: Any) -> Any
     return model
 
 
-def updates_of(model: Any) -> Work:
+def updates_of(model: Any, n_calls: int = N_CALLS) -> Work:
     """Call ``train`` and count updates, with ours bound to its engine as during ``learn``."""
-    learning = model._runtime.running if isinstance(model, SACFlow) else nullcontext
+    learning = model._runtime.running if isinstance(model, EngineFlow) else nullcontext
 
     def work() -> float:
         with learning():
-            for _ in range(N_CALLS):
+            for _ in range(n_calls):
                 model.train(gradient_steps=N_UPDATES, batch_size=BATCH_SIZE)
-        return N_CALLS * N_UPDATES
+        return n_calls * N_UPDATES
 
     return work
 

@@ -1,12 +1,11 @@
-"""The engine: binds SAC models to flat tensors, updates them, and releases them."""
+"""The engine: binds models to flat tensors, updates them, and releases them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch as th
-from stable_baselines3 import SAC
-from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 from sb3_flowpolicy.engine.adam import FlatAdam, why_optimizer_unsupported
@@ -32,12 +31,12 @@ MODE_DEPENDENT = (
 )
 
 
-def why_unsupported(model: SAC) -> str | None:
+def why_unsupported(model: Any) -> str | None:
     """Return what about a model the engine does not support; None if it supports everything."""
     policy = model.policy
     if not isinstance(policy.actor, FlowActor):
         return f"actor of type {type(policy.actor).__name__}"
-    if type(policy.critic) is not ContinuousCritic:
+    if type(policy.critic) is not model.objective().critic_type:
         return f"critic of type {type(policy.critic).__name__}"
     if not isinstance(model.observation_space.shape, tuple) or model.observation_space.shape == ():
         return f"observation space {model.observation_space}"
@@ -62,22 +61,22 @@ def why_unsupported(model: SAC) -> str | None:
     return None
 
 
-def settings_key(model: SAC, critic_loss_coef: float) -> tuple[object, ...]:
+def settings_key(model: Any) -> tuple[object, ...]:
     """Return all constants of an update, for a quick comparison."""
     groups = [model.actor.optimizer.param_groups[0], model.critic.optimizer.param_groups[0]]
     if model.ent_coef_optimizer is not None:
         groups.append(model.ent_coef_optimizer.param_groups[0])
     names = ("betas", "eps", "weight_decay", "amsgrad", "maximize")
     adam = [group.get(name) for group in groups for name in names]
-    return (model.tau, critic_loss_coef, model.target_entropy, *adam)
+    return (model.objective(), model.tau, model.target_entropy, *adam)
 
 
 class Engine:
     """Updates S models in lockstep. Their modules and optimizers become views of its tensors.
 
     Args:
-        models: S models that differ in nothing but weights, data and random numbers.
-        critic_loss_coef: Factor of the critics' summed mean squared error; 0.5 in SB3.
+        models: S models that differ in nothing but weights, data and random numbers. Their method
+            ``objective()`` says what they do with their critics.
         compiled: Whether to compile the update. Where no compiler works, it runs eagerly, with
             one warning and the same numbers.
         autocast: Whether matrix products of updates run in bfloat16.
@@ -85,8 +84,7 @@ class Engine:
 
     def __init__(
         self,
-        models: Sequence[SAC],
-        critic_loss_coef: float = 0.5,
+        models: Sequence[Any],
         compiled: bool = False,
         autocast: bool = False,
     ) -> None:
@@ -106,26 +104,27 @@ class Engine:
         if first.ent_coef_optimizer is not None:
             # Not a module's parameter, but owned by an optimizer all the same.
             self.log_ent_coef = FlatParameters(
-                [{"log_ent_coef": [model.log_ent_coef]} for model in self.models]  # type: ignore[list-item]
+                [{"log_ent_coef": [model.log_ent_coef]} for model in self.models]
             )
             optimizers = [model.ent_coef_optimizer for model in self.models]
-            self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)  # type: ignore[arg-type]
+            self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)
         learned = self.ent_coef_adam
         settings = UpdateSettings(
+            objective=first.objective(),
             tau=first.tau,
-            critic_loss_coef=critic_loss_coef,
             target_entropy=float(first.target_entropy),
             actor_adam=self.actor_adam.settings,
             critic_adam=self.critic_adam.settings,
             ent_coef_adam=None if learned is None else learned.settings,
         )
-        self.critic_loss_coef = critic_loss_coef
-        self.settings_key = settings_key(first, critic_loss_coef)
+        self.settings_key = settings_key(first)
         self._identities = [_identity(model) for model in self.models]
         self._slots = [slot for model in self.models for slot in _slots(model)]
         self._update = make_update(self.networks, settings)
         device = self.networks.actor.data.device
-        self._compiled_update = Compiled(self._update, "the SAC update", device)
+        self._compiled_update = Compiled(
+            self._update, f"the {settings.objective.name} update", device
+        )
         networks = self.networks
 
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
@@ -146,9 +145,9 @@ class Engine:
         broken = self._compiled_update.broken or self._compiled_sample.broken
         return self.compiled and not broken
 
-    def fits(self, models: Sequence[SAC]) -> bool:
+    def fits(self, models: Sequence[Any]) -> bool:
         """Whether these still are the models, with the same networks, optimizers and constants."""
-        if self.settings_key != settings_key(models[0], self.critic_loss_coef):
+        if self.settings_key != settings_key(models[0]):
             return False
         for model, kept in zip(models, self._identities, strict=True):
             if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):
@@ -318,7 +317,7 @@ class Engine:
         return self._compiled_update(key, state, batch, learning_rates, move_target)
 
 
-def _can_be_rows(model: SAC) -> bool:
+def _can_be_rows(model: Any) -> bool:
     """Whether minibatches can be rows of floats; pixels would take four times the memory."""
     buffer = model.replay_buffer
     if buffer is None or not is_plain(buffer) or model.get_vec_normalize_env() is not None:
@@ -326,7 +325,7 @@ def _can_be_rows(model: SAC) -> bool:
     return buffer.observations.dtype.kind == "f"
 
 
-def _identity(model: SAC) -> tuple[object, ...]:
+def _identity(model: Any) -> tuple[object, ...]:
     """Return the objects whose tensors an engine has bound."""
     return (
         model.policy,
@@ -337,7 +336,7 @@ def _identity(model: SAC) -> tuple[object, ...]:
     )
 
 
-def _slots(model: SAC) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter, bool]]:
+def _slots(model: Any) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter, bool]]:
     """Return where the first parameter of each network is, the parameter, and whether it trains.
 
     Parameters are replaced or frozen all at once, by ``load_state_dict(assign=True)`` or

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch as th
-from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 # Measured on a core with 2 MiB of second-level cache, batches of 256, ten seeds, two critics:
@@ -11,7 +12,7 @@ from torch import nn
 BYTES_AT_ONCE = 700_000
 
 
-def seeds_at_once(critic: ContinuousCritic, n_seeds: int, batch_size: int) -> int:
+def seeds_at_once(critic: Any, n_seeds: int, batch_size: int) -> int:
     """Return how many of S seeds to update together: a divisor of S.
 
     The critics' widest layer decides, as its activations are the largest tensors of an update. On

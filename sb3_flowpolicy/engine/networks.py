@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch as th
-from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.func import functional_call, vmap
 
@@ -35,7 +34,7 @@ class StackedNetworks:
         autocast: Whether matrix products run in bfloat16; parameters and results stay as they are.
     """
 
-    def __init__(self, policies: Sequence[SACPolicy], autocast: bool = False) -> None:
+    def __init__(self, policies: Sequence[Any], autocast: bool = False) -> None:
         first = policies[0]
         assert isinstance(first.actor, FlowActor)
         self.autocast = autocast
@@ -86,7 +85,7 @@ class StackedNetworks:
             actions: Scaled actions, (S, B, D).
 
         Returns:
-            Values, (S, C, B).
+            Values or quantiles, (S, C, B, Q).
         """
         extractor = self._critic.features_extractor
         features = self._critic.extract_features(obs.flatten(0, 1), extractor)
@@ -100,14 +99,14 @@ class StackedNetworks:
                     hidden = hidden @ weight.mT + bias.unsqueeze(-2)
                 else:
                     hidden = layer(hidden)
-        return hidden.squeeze(-1).to(critic.dtype)
+        return hidden.to(critic.dtype)
 
 
-def _actor_layout(policy: SACPolicy) -> Layout:
+def _actor_layout(policy: Any) -> Layout:
     return {f"actor.{name}": [value] for name, value in policy.actor.named_parameters()}
 
 
-def _critic_layout(critic: ContinuousCritic) -> Layout:
+def _critic_layout(critic: Any) -> Layout:
     """Return each weight's copies in all C critics."""
     copies = [dict(network.named_parameters()) for network in critic.q_networks]
     return {name: [copy[name] for copy in copies] for name in copies[0]}

@@ -21,8 +21,8 @@ class EngineRuntime:
     settings meanwhile, so with callbacks the binding is checked before every use; else once.
 
     Args:
-        models: SACFlow models that differ only in weights, data and random numbers. Their
-            attributes ``compile``, ``autocast`` and ``critic_loss_coef`` say how to update them.
+        models: Models that differ only in weights, data and random numbers. Their attributes
+            ``compile`` and ``autocast`` and their method ``objective()`` say how to update them.
         refuse: Called with a reason when the engine does not support the models.
     """
 
@@ -113,10 +113,7 @@ class EngineRuntime:
             self._refused = True
             self._refuse(reason)
         elif self._engine is None:
-            first = self.models[0]
-            self._engine = Engine(
-                self.models, first.critic_loss_coef, self.compiles, first.autocast
-            )
+            self._engine = Engine(self.models, self.compiles, self.models[0].autocast)
         return self._engine
 
     def drop(self) -> None:

@@ -1,13 +1,14 @@
-"""One SAC update, written once: eager, compiled, for one seed or S of them."""
+"""One update of an actor and critics, written once: eager, compiled, for one seed or S of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch as th
+from torch import nn
 
 from sb3_flowpolicy.engine.adam import AdamSettings, adam_step
 from sb3_flowpolicy.engine.networks import StackedNetworks
@@ -77,12 +78,36 @@ LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 """What SB3 logs of an update: the rows of the tensor (4, S) that an update returns."""
 
 
+class Objective(Protocol):
+    """What an algorithm makes of the critics' outputs, (S, C, B, Q): Q numbers per row and critic.
+
+    Objectives are compared by value, as their constants are compiled into the update.
+    """
+
+    @property
+    def name(self) -> str:
+        """The algorithm's name, for messages."""
+
+    @property
+    def critic_type(self) -> type[nn.Module]:
+        """The critics that it understands."""
+
+    def next_values(self, outputs: th.Tensor) -> th.Tensor:
+        """Return what target critics say about the next observations, (S, B, T)."""
+
+    def critic_loss(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
+        """Return the loss (S,) of critics whose outputs are compared with targets (S, B, T)."""
+
+    def actor_values(self, outputs: th.Tensor) -> th.Tensor:
+        """Return the values (S, B) that the actor maximizes."""
+
+
 @dataclass(frozen=True)
 class UpdateSettings:
     """Constants of an update: they are compiled into it."""
 
+    objective: Objective
     tau: float
-    critic_loss_coef: float
     target_entropy: float
     actor_adam: AdamSettings
     critic_adam: AdamSettings
@@ -96,12 +121,13 @@ Update = Callable[[TrainState, Batch, th.Tensor, bool], th.Tensor]
 def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
     r"""Return the function that performs one update of all seeds, in place.
 
-    It is SB3's ``SAC.train``, in its order: entropy coefficient, critics, actor, target networks.
+    It is the ``train`` of SB3's SAC and sb3-contrib's TQC, in their order: entropy coefficient,
+    critics, actor, target networks. The objective says what V', L_Q and V are.
 
     .. math::
-        y &= r + \gamma (1 - d) (\min_c Q_c^{target}(s', a') - \alpha \log \pi(a' | s')) \\
-        L_Q &= k \sum_c \mathrm{mean} (Q_c(s, a) - y)^2 \\
-        L_\pi &= \mathrm{mean} (\alpha \log \pi(\tilde a | s) - \min_c Q_c(s, \tilde a))
+        y &= r + \gamma (1 - d) (V'(Q^{target}(s', a')) - \alpha \log \pi(a' | s')) \\
+        L_Q &= L_Q(Q(s, a), y) \\
+        L_\pi &= \mathrm{mean} (\alpha \log \pi(\tilde a | s) - V(Q(s, \tilde a)))
 
     Args:
         networks: The networks of S seeds.
@@ -114,6 +140,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
     References:
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.
     """
+    objective = settings.objective
 
     def update(
         state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
@@ -142,22 +169,23 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
             next_actions, next_log_prob = networks.sample(
                 state.actor, batch.next_obs, batch.noise[1]
             )
-            next_q = networks.q_values(state.target, batch.next_obs, next_actions).amin(1)
-            next_value = next_q - ent_coef * next_log_prob
-            target_q = batch.rewards + (1 - batch.dones) * batch.discounts * next_value
+            outputs = networks.q_values(state.target, batch.next_obs, next_actions)
+            entropy = ent_coef * next_log_prob
+            next_values = objective.next_values(outputs) - entropy.unsqueeze(-1)
+            discounts = (1 - batch.dones) * batch.discounts
+            targets = batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
 
         critic = state.critic.detach().requires_grad_()
-        current_q = networks.q_values(critic, batch.obs, batch.actions)
-        errors = current_q - target_q.unsqueeze(1)
-        critic_loss = settings.critic_loss_coef * errors.square().mean(-1).sum(1)
+        outputs = networks.q_values(critic, batch.obs, batch.actions)
+        critic_loss = objective.critic_loss(outputs, targets)
         # Seeds do not share parameters: the gradient of the sum is each seed's own.
         (gradient,) = th.autograd.grad(critic_loss.sum(), critic)
         new_critic, *critic_moments = adam_step(
             state.critic, gradient, *state.critic_moments, learning_rates[1], settings.critic_adam
         )
 
-        q_pi = networks.q_values(new_critic, batch.obs, actions_pi).amin(1)
-        actor_loss = (ent_coef * log_prob - q_pi).mean(-1)
+        outputs = networks.q_values(new_critic, batch.obs, actions_pi)
+        actor_loss = (ent_coef * log_prob - objective.actor_values(outputs)).mean(-1)
         (gradient,) = th.autograd.grad(actor_loss.sum(), actor)
         new_actor, *actor_moments = adam_step(
             state.actor, gradient, *state.actor_moments, learning_rates[0], settings.actor_adam

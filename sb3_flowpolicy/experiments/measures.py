@@ -6,7 +6,7 @@ gives the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium.vector import VectorEnv
 
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.seeds.setup import make_env, make_vec_env
@@ -88,7 +89,7 @@ class DeterministicEpisodes:
         self.venv: VectorEnv = make_vec_env(env, n_models * n_episodes)
 
     def run(
-        self, models: list[SACFlow], seeds: tuple[int, ...], deterministic: bool = True
+        self, models: Sequence[EngineFlow], seeds: tuple[int, ...], deterministic: bool = True
     ) -> list[tuple[float, float | None]]:
         """Return mean return and success rate of each policy, exploring if not ``deterministic``.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import torch as th
 from filelock import FileLock, Timeout
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.common.machine import machine
 from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
@@ -214,7 +215,7 @@ class _Training:
         success.clear()
         return row
 
-    def _record(self, kind: str, measure: Callable, models: list[SACFlow]) -> None:
+    def _record(self, kind: str, measure: Callable, models: Sequence[EngineFlow]) -> None:
         for model in models:
             content = measure(model, self.env, model.seed)
             if content is not None:

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
-from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.segments import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
@@ -44,7 +45,7 @@ _SCHEDULE_AT = (1.0, 0.5, 0.0)
 
 
 class SeedBatch:
-    """Train S independent :class:`SACFlow` agents in one process, by stacking their networks.
+    """Train S independent agents in one process, by stacking their networks.
 
     Each seed has its own environment, replay buffer, random numbers and logs; given the same
     minibatches and noise, one stacked update equals S single ones. Memory: S replay buffers
@@ -57,7 +58,7 @@ class SeedBatch:
         env: Registered id, or a function that makes an environment. The environment's own
             vectorized form is used if it has one.
         seeds: The seeds, or their number, which stands for 0, 1, ...
-        algorithm: Class of the agents.
+        algorithm: Class of the agents, :class:`SACFlow` or :class:`TQCFlow`.
         monitor_dir: Folder for one ``monitor.csv`` per seed, as SB3's ``Monitor`` writes them.
         info_keywords: Numbers to record for each episode, besides return and length, from the info
             of its last step, as in SB3's ``Monitor``.
@@ -75,10 +76,10 @@ class SeedBatch:
 
     def __init__(
         self,
-        policy: str | type[SACPolicy],
+        policy: str | type[BasePolicy],
         env: str | EnvFactory,
         seeds: int | Iterable[int],
-        algorithm: type[SACFlow] = SACFlow,
+        algorithm: type[EngineFlow] = SACFlow,
         monitor_dir: str | Path | None = None,
         info_keywords: Sequence[str] = (),
         **kwargs: Any,
@@ -91,7 +92,7 @@ class SeedBatch:
 
     def _set_up(
         self,
-        agents: dict[str, SACFlow],
+        agents: dict[str, EngineFlow],
         env: str | EnvFactory,
         monitor_dir: str | Path | None,
         info_keywords: Sequence[str],
@@ -110,7 +111,7 @@ class SeedBatch:
         self._guard = TrainingGuard(self._models, self.seeds)
 
     @property
-    def models(self) -> list[SACFlow]:
+    def models(self) -> list[EngineFlow]:
         """The agents: ordinary models that save, load, predict and train on their own."""
         return self._models
 
@@ -119,7 +120,7 @@ class SeedBatch:
         cls: type[SelfBatch],
         path: str | Path,
         env: str | EnvFactory,
-        algorithm: type[SACFlow] = SACFlow,
+        algorithm: type[EngineFlow] = SACFlow,
         monitor_dir: str | Path | None = None,
         info_keywords: Sequence[str] = (),
     ) -> SelfBatch:
@@ -342,9 +343,9 @@ class SeedBatch:
         return self._checkpoints.resuming and "batch" not in self._checkpoints.opaque
 
 
-def _shared_settings(model: SACFlow) -> tuple[object, ...]:
+def _shared_settings(model: EngineFlow) -> tuple[object, ...]:
     return (
-        settings_key(model, model.critic_loss_coef),
+        settings_key(model),
         *(getattr(model, name) for name in _COMMON),
         *(model.lr_schedule(left) for left in _SCHEDULE_AT),
     )

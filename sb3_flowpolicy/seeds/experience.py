@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
-from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.engine.update import Batch
 from sb3_flowpolicy.guard.finite import check_experience
@@ -27,7 +27,7 @@ class SeedExperience:
         env: Registered id, or a function that makes an environment.
     """
 
-    def __init__(self, models: Sequence[SACFlow], seeds: Sequence[int], env: str | EnvFactory):
+    def __init__(self, models: Sequence[EngineFlow], seeds: Sequence[int], env: str | EnvFactory):
         self.models, self.seeds = models, seeds
         self.venv = make_vec_env(env, len(seeds))
         self.obs: np.ndarray | None = None

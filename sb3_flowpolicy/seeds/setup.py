@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
-from sb3_flowpolicy.algorithms.sac_flow import SACFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.engine import why_unsupported
 from sb3_flowpolicy.engine.replay import is_plain
 
@@ -49,7 +49,7 @@ def copy_callback(
     return None if callback is None else callback(seed)
 
 
-def check_stackable(model: SACFlow) -> None:
+def check_stackable(model: EngineFlow) -> None:
     """Raise ``ValueError`` if agents like this one cannot be trained in lockstep."""
     reason, frequency, buffer = why_unsupported(model), model.train_freq, model.replay_buffer
     assert isinstance(frequency, TrainFreq)

@@ -243,9 +243,9 @@ def test_auto_compiles_once_all_calls_of_learn_together_repay_it(
     asked = []
 
     class Recorder(Engine):
-        def __init__(self, models: Any, critic_loss_coef: float, compiled: bool, *rest: Any):
+        def __init__(self, models: Any, compiled: bool, autocast: bool):
             asked.append(compiled)
-            super().__init__(models, critic_loss_coef, False, *rest)
+            super().__init__(models, False, autocast)
 
     monkeypatch.setattr(runtime, "Engine", Recorder)
     monkeypatch.setattr(runtime, "UPDATES_WORTH_COMPILING", 50)

@@ -1,4 +1,4 @@
-"""The engine's updates are SB3's, number by number: before speed is worth a word."""
+"""The engine's updates are SB3's and sb3-contrib's, number by number."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy import SACFlow, TQCFlow
 from sb3_flowpolicy.engine import Engine, groups
 
 N_UPDATES = 20
 BATCH_SIZE = 32
 # Densities that have no policy class of their own: in place of one, their name.
 WITHOUT_POLICY = ["lattice", "spline"]
+OURS: dict[Any, Any] = {SAC: SACFlow, TQC: TQCFlow}
 
 
 class DoubleExtractor(FlattenExtractor):
@@ -37,14 +39,14 @@ class Box(gym.Env):
     action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
 
 
-def make(algorithm: type[SAC], policy: str, dtype: th.dtype, seed: int = 0, **settings: Any) -> SAC:
+def make(algorithm: Any, policy: str, dtype: th.dtype, seed: int = 0, **settings: Any) -> Any:
     policy_kwargs = {"net_arch": [16, 16], **settings.pop("policy_kwargs", {})}
     if dtype == th.float64:
         policy_kwargs["features_extractor_class"] = DoubleExtractor
     if policy in WITHOUT_POLICY:
         policy, policy_kwargs["distribution"] = "FlowPolicy", policy
-    if algorithm is SAC:
-        policy = SACFlow.policy_aliases[policy] if policy != "MlpPolicy" else policy  # type: ignore[assignment]
+    if algorithm in OURS and policy != "MlpPolicy":
+        policy = OURS[algorithm].policy_aliases[policy]
     model = algorithm(
         policy,
         Box(),
@@ -112,7 +114,13 @@ def stock_loop(model: SAC, n_updates: int = N_UPDATES) -> None:
 
 
 def check_equal_to_sb3(
-    policy: str, weight_decay: float, ent_coef: Any, dtype: th.dtype, compile: bool
+    policy: str,
+    weight_decay: float,
+    ent_coef: Any,
+    dtype: th.dtype,
+    compile: bool,
+    stock_algorithm: Any = SAC,
+    **more: Any,
 ) -> None:
     """For "MlpPolicy" the peer is untouched SB3, for the others SB3's loop with our policy."""
     ours_policy = "GaussPolicy" if policy == "MlpPolicy" else policy
@@ -121,15 +129,15 @@ def check_equal_to_sb3(
         policy_kwargs["net_arch"] = [16]
         if policy in ("FlowPolicy", "spline"):
             policy_kwargs["distribution_kwargs"] = {"layers": 2, "hidden": [10]}
-    settings = {"ent_coef": ent_coef, "policy_kwargs": policy_kwargs}
-    stock = make(SAC, policy, dtype, **settings)
-    ours = make(SACFlow, ours_policy, dtype, compile=compile, **settings)
+    policy_kwargs |= more.pop("policy_kwargs", {})
+    settings = {"ent_coef": ent_coef, "policy_kwargs": policy_kwargs, **more}
+    stock = make(stock_algorithm, policy, dtype, **settings)
+    ours = make(OURS[stock_algorithm], ours_policy, dtype, compile=compile, **settings)
     ours.policy.load_state_dict(stock.policy.state_dict())
     seed_everything()
     stock_loop(stock)
     seed_everything()
     ours.train(N_UPDATES, batch_size=BATCH_SIZE)
-    assert isinstance(ours, SACFlow)
     assert ours._runtime._engine is not None  # neither took SB3's loop ...
     assert ours._runtime._engine.compiled == compile
     assert not ours._runtime._engine._compiled_update.broken  # ... nor gave up compiling
@@ -170,16 +178,50 @@ def test_compiled_engine_equals_sb3(
     check_equal_to_sb3(policy, weight_decay, ent_coef, dtype, compile=True)
 
 
+TQC_SETTINGS: dict[str, Any] = {
+    "stock_algorithm": TQC,
+    "top_quantiles_to_drop_per_net": 1,
+    "policy_kwargs": {"n_quantiles": 5, "n_critics": 3, "net_arch": [16]},
+}
+
+
+@pytest.mark.parametrize("compile", [False, True], ids=["eager", "compiled"])
+@pytest.mark.parametrize(
+    ("policy", "ent_coef", "dtype"),
+    [("MlpPolicy", "auto", th.float32), ("LowRankPolicy", 0.1, th.float64)],
+)
+def test_tqc_equals_sb3_contribs(
+    policy: str, ent_coef: Any, dtype: th.dtype, compile: bool
+) -> None:
+    settings = {**TQC_SETTINGS, "target_update_interval": 1 if compile else 3}
+    check_equal_to_sb3(policy, 2.5e-4, ent_coef, dtype, compile, **settings)
+
+
+def test_tqc_with_a_flow_equals_sb3_contribs() -> None:
+    """With all quantiles, and with the default numbers of critics and quantiles."""
+    settings = {"stock_algorithm": TQC, "top_quantiles_to_drop_per_net": 0}
+    check_equal_to_sb3("FlowPolicy", 0.0, "auto", th.float64, False, **settings)
+
+
 @pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY])
 @pytest.mark.parametrize("ent_coef", [0.1, "auto"])
 @pytest.mark.parametrize("dtype", [th.float32, th.float64], ids=["float32", "float64"])
 def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th.dtype) -> None:
-    n_seeds = 4
+    check_stacked(SACFlow, policy, ent_coef, dtype)
+
+
+def test_stacked_update_of_tqc_equals_single_ones() -> None:
+    check_stacked(TQCFlow, "LowRankPolicy", "auto", th.float32, n_seeds=2)
+
+
+def check_stacked(
+    algorithm: Any, policy: str, ent_coef: Any, dtype: th.dtype, n_seeds: int = 4
+) -> None:
     settings = {"ent_coef": ent_coef}
     settings["policy_kwargs"] = {"optimizer_kwargs": {"weight_decay": 2.5e-4}}
 
-    def models() -> list[SAC]:
-        return [make(SACFlow, policy, dtype, seed=seed, **settings) for seed in range(n_seeds)]
+    def models() -> list[Any]:
+        return [make(algorithm, policy, dtype, seed=seed, **settings) for seed in range(n_seeds)]
 
     stacked = Engine(models())
     singles = [Engine([model]) for model in models()]

@@ -15,7 +15,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
-from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy import SACFlow, TQCFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.engine import Engine
 from tests.engine.test_equality import (
     BATCH_SIZE,
@@ -177,6 +178,17 @@ def test_settings_changed_between_updates_are_noticed() -> None:
     assert all(th.equal(target[key], value) for key, value in critic.items())
 
 
+def test_other_numbers_of_quantiles_are_noticed() -> None:
+    kept, changed = (make(TQCFlow, "GaussPolicy", th.float32, compile=False) for _ in range(2))
+    for model in (kept, changed):
+        for dropped in (2, 2 if model is kept else 20):
+            model.top_quantiles_to_drop_per_net = dropped
+            seed_everything()
+            model.train(3, batch_size=BATCH_SIZE)
+    losses = [model.logger.name_to_value["train/critic_loss"] for model in (kept, changed)]
+    assert losses[0] != losses[1]
+
+
 def test_released_models_own_their_memory() -> None:
     models = [make(SACFlow, "FlowPolicy", th.float32, seed=seed) for seed in range(2)]
     engine = Engine(models)
@@ -251,7 +263,7 @@ class ActInCallback(BaseCallback):
         self.compared = 0
 
     def _on_step(self) -> bool:
-        assert isinstance(self.model, SACFlow)
+        assert isinstance(self.model, EngineFlow)
         if self.num_timesteps < 30:
             return True
         if self.num_timesteps == 35:  # other weights have to be noticed
@@ -273,10 +285,18 @@ class ActInCallback(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy"])
+@pytest.mark.parametrize(
+    ("algorithm", "policy"),
+    [
+        (SACFlow, "GaussPolicy"),
+        (SACFlow, "LowRankPolicy"),
+        (SACFlow, "FlowPolicy"),
+        (TQCFlow, "FlowPolicy"),
+    ],
+)
 @pytest.mark.parametrize("mode", ["base", "log_prob"])
 def test_callbacks_act_with_the_compiled_policy(
-    policy: str, mode: str, monkeypatch: pytest.MonkeyPatch
+    algorithm: Any, policy: str, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     acted: list[tuple[int, ...]] = []
     act = Engine.act
@@ -289,7 +309,7 @@ def test_callbacks_act_with_the_compiled_policy(
     # The function itself in place of its graph: compiling is not what is tested here.
     monkeypatch.setattr(th, "compile", lambda function, **_: function)
     settings = {"policy_kwargs": {"net_arch": [8], "deterministic_mode": mode}, "batch_size": 4}
-    model = SACFlow(policy, "Pendulum-v1", learning_starts=20, compile=True, seed=0, **settings)
+    model = algorithm(policy, "Pendulum-v1", learning_starts=20, compile=True, seed=0, **settings)
     callback = ActInCallback()
     model.learn(40, callback=callback)
     assert callback.compared == 11

@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.noise import NormalActionNoise
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy import SACFlow, SeedBatch
+from sb3_flowpolicy import SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
 
 FAST: dict[str, Any] = {
@@ -32,11 +32,13 @@ def vector(model: SACFlow) -> np.ndarray:
     return model.policy.parameters_to_vector()
 
 
-def test_an_agent_does_not_depend_on_its_company() -> None:
+@pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow])
+def test_an_agent_does_not_depend_on_its_company(algorithm: Any) -> None:
     """Seed 7 alone, with others, and first or last: the same agent."""
-    alone = SeedBatch("FlowPolicy", ENV, [7], **FAST).learn(90).models[0]
-    first = SeedBatch("FlowPolicy", ENV, [7, 1, 2], **FAST).learn(90).models[0]
-    last = SeedBatch("FlowPolicy", ENV, [5, 7], **FAST).learn(90).models[1]
+    settings = {"algorithm": algorithm, **FAST}
+    alone = SeedBatch("FlowPolicy", ENV, [7], **settings).learn(90).models[0]
+    first = SeedBatch("FlowPolicy", ENV, [7, 1, 2], **settings).learn(90).models[0]
+    last = SeedBatch("FlowPolicy", ENV, [5, 7], **settings).learn(90).models[1]
     np.testing.assert_allclose(vector(first), vector(alone), rtol=2e-3, atol=2e-4)
     np.testing.assert_allclose(vector(last), vector(alone), rtol=2e-3, atol=2e-4)
     assert last.replay_buffer is not None
@@ -56,8 +58,9 @@ def test_seeds_reproduce_and_differ() -> None:
     assert not np.array_equal(once[0], once[1])
 
 
-def test_models_are_ordinary_models(tmp_path: Path) -> None:
-    batch = SeedBatch("FlowPolicy", ENV, [3, 4], **FAST).learn(70)
+@pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow])
+def test_models_are_ordinary_models(algorithm: Any, tmp_path: Path) -> None:
+    batch = SeedBatch("FlowPolicy", ENV, [3, 4], algorithm=algorithm, **FAST).learn(70)
     obs = np.zeros((5, 2), dtype=np.float32)
     for model in batch.models:
         assert model.num_timesteps == 70
@@ -66,12 +69,12 @@ def test_models_are_ordinary_models(tmp_path: Path) -> None:
         assert model.replay_buffer.size() == 70
         expected, _ = model.predict(obs, deterministic=True)
         model.save(tmp_path / "model")
-        loaded = SACFlow.load(tmp_path / "model", env=gym.make(ENV))
+        loaded = algorithm.load(tmp_path / "model", env=gym.make(ENV))
         np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], expected)
         model.save_replay_buffer(tmp_path / "buffer")
         loaded.load_replay_buffer(tmp_path / "buffer")
         np.testing.assert_array_equal(
-            loaded.replay_buffer.observations[:70],  # type: ignore[union-attr]
+            loaded.replay_buffer.observations[:70],
             model.replay_buffer.observations[:70],
         )
     # One of them trains on alone and leaves the other as it was.
