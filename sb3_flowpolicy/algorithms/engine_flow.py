@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, TrainFreq
 
 from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
 from sb3_flowpolicy.common.validation import check_settings, either, flag
-from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
+from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, build_engine, why_unsupported
 from sb3_flowpolicy.engine.update import Objective
 from sb3_flowpolicy.guard.finite import check_observation
 from sb3_flowpolicy.policies.base import check_finite
@@ -59,7 +59,7 @@ class EngineFlow(OffPolicyFlow):
         check_settings({"compile": compile, "autocast": autocast}, self.settings)
         self.compile: bool | Literal["auto"] = compile
         self.autocast = autocast
-        self._runtime = EngineRuntime([self], _warn_of_sb3s_loop)
+        self._runtime = EngineRuntime([self], why_unsupported, build_engine, warn_of_sb3s_loop)
         super().__init__(*args, **kwargs)
 
     @abstractmethod
@@ -118,7 +118,7 @@ class EngineFlow(OffPolicyFlow):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        self._runtime.plan(self._planned_updates(total_timesteps))
+        self._runtime.plan(self._n_updates, self._planned_updates(total_timesteps))
         return total_timesteps, callback
 
     def _sample_action(
@@ -189,7 +189,8 @@ class EngineFlow(OffPolicyFlow):
         return [*super()._excluded_save_params(), "_runtime"]
 
 
-def _warn_of_sb3s_loop(reason: str) -> None:
+def warn_of_sb3s_loop(reason: str) -> None:
+    """Say that the engine does not do something."""
     warnings.warn(
         f"training runs SB3's own loop, which is slower: the engine does not do {reason}",
         UserWarning,

@@ -8,8 +8,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import explained_variance
 
+from sb3_flowpolicy.algorithms.engine_flow import warn_of_sb3s_loop
 from sb3_flowpolicy.common.validation import (
     Check,
     by_name,
@@ -23,9 +25,8 @@ from sb3_flowpolicy.common.validation import (
     or_infinity,
     or_schedule,
 )
-from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
-from sb3_flowpolicy.engine.ppo_engine import PPOEngine, why_ppo_unsupported
-from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
+from sb3_flowpolicy.engine import EngineRuntime
+from sb3_flowpolicy.engine.ppo_engine import PPOEngine, build_ppo_engine, why_ppo_unsupported
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy
 
@@ -61,8 +62,8 @@ class PPOFlow(PPO):
         compile: Whether to compile updates and the policy that collects experience: several times
             faster after about 15 seconds of warm-up. ``"auto"`` compiles once calls of
             :meth:`learn` have planned enough updates to repay it. Compiled or not, the numbers are
-            the same up to rounding. Policies and buffers that cannot be compiled (with dropout,
-            frozen parameters, dictionary observations, ...) run SB3's own loop.
+            the same up to rounding. Policies and buffers that the engine does not support (with
+            dropout, frozen parameters, dictionary observations, ...) run SB3's own loop.
         **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that
             successive actions are independent.
 
@@ -83,45 +84,32 @@ class PPOFlow(PPO):
         check_settings({**given, "compile": compile}, _SETTINGS)
         check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
         self.compile: bool | Literal["auto"] = compile
-        self._planned_updates = 0
-        self._engine: PPOEngine | None = None
+        self._runtime = EngineRuntime(
+            [self], why_ppo_unsupported, build_ppo_engine, warn_of_sb3s_loop
+        )
         super().__init__(*args, **kwargs)
 
-    def learn(self, *args: Any, **kwargs: Any) -> Any:
+    def learn(
+        self, total_timesteps: int, callback: MaybeCallback = None, *args: Any, **kwargs: Any
+    ) -> Any:
         """Learn as SB3's PPO does, compiled where that pays."""
-        size = sum(parameter.numel() for parameter in self.policy.parameters())
-        try:
-            with threads_for(size * self.batch_size), flushed_subnormals():
-                return super().learn(*args, **kwargs)
-        finally:
-            if self._engine is not None:
-                self._engine.release()
+        with self._runtime.running(watched=callback is not None):
+            return super().learn(total_timesteps, callback, *args, **kwargs)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         rollout = self.n_steps * self.n_envs
         rollouts = math.ceil((total_timesteps - self.num_timesteps) / rollout)
-        self._planned_updates += rollouts * self.n_epochs * math.ceil(rollout / self.batch_size)
+        minibatches = math.ceil(rollout / self.batch_size)
+        # SB3 counts epochs as updates.
+        done, updates = self._n_updates, rollouts * self.n_epochs
+        self._runtime.plan(done * minibatches, updates * minibatches)
         return total_timesteps, callback
-
-    def _bound_engine(self) -> PPOEngine | None:
-        """Return the engine, bound to the policy as it is now; None for SB3's own loop."""
-        enough = self._planned_updates >= UPDATES_WORTH_COMPILING
-        wanted = enough if self.compile == "auto" else self.compile
-        wanted = wanted and why_ppo_unsupported(self) is None
-        if self._engine is not None and not (wanted and self._engine.fits()):
-            self._engine.release()
-            self._engine = None
-        if not wanted:
-            return None
-        if self._engine is None:
-            self._engine = PPOEngine(self)
-        self._engine.synchronize()
-        return self._engine
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
         """Collect experience as SB3 does."""
-        engine = self._bound_engine()
+        acts = self._runtime.is_running and self._runtime.compiles
+        engine = self._runtime.engine() if acts else None
         if engine is None:
             return super().collect_rollouts(*args, **kwargs)
         with engine.collecting():
@@ -148,11 +136,12 @@ class PPOFlow(PPO):
         # Otherwise a tenth of the time would go into an entropy that is multiplied by 0.
         if isinstance(self.policy, on_policy.DensityActorCritic):
             self.policy.action_dist.estimates_entropy = self.ent_coef != 0.0
-        engine = self._bound_engine()
-        if engine is None:
-            super().train()
-        else:
-            self._train_with(engine)
+        with self._runtime.running():
+            engine = self._runtime.engine()
+            if engine is None:
+                super().train()
+            else:
+                self._train_with(engine)
 
     def _train_with(self, engine: PPOEngine) -> None:
         """Do and record what SB3's ``train`` does and records."""
@@ -176,4 +165,4 @@ class PPOFlow(PPO):
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_engine"]
+        return [*super()._excluded_save_params(), "_runtime"]

@@ -20,7 +20,7 @@ from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, stock_block, zoo_block
 from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
-from sb3_flowpolicy.engine import EngineRuntime
+from sb3_flowpolicy.engine import EngineRuntime, build_engine, why_unsupported
 from sb3_flowpolicy.policies import FlowPolicy
 from sb3_flowpolicy.seeds.setup import refuse
 
@@ -117,7 +117,7 @@ def _stacked_seeds() -> Benchmark:
 
     def stacked(algorithm: str) -> Work:
         seeds = models(algorithm)
-        runtime = EngineRuntime(seeds, refuse)
+        runtime = EngineRuntime(seeds, why_unsupported, build_engine, refuse)
 
         def work() -> float:
             with runtime.running():

@@ -71,6 +71,11 @@ def settings_key(model: Any) -> tuple[object, ...]:
     return (model.objective(), model.tau, model.target_entropy, *adam)
 
 
+def build_engine(models: Sequence[Any], compiled: bool) -> Engine:
+    """Make the engine that the models' settings ask for."""
+    return Engine(models, compiled, models[0].autocast)
+
+
 class Engine:
     """Updates S models in lockstep. Their modules and optimizers become views of its tensors.
 
@@ -147,7 +152,8 @@ class Engine:
 
     def fits(self, models: Sequence[Any]) -> bool:
         """Whether these still are the models, with the same networks, optimizers and constants."""
-        if self.settings_key != settings_key(models[0]):
+        first = models[0]
+        if self.autocast != first.autocast or self.settings_key != settings_key(first):
             return False
         for model, kept in zip(models, self._identities, strict=True):
             if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -58,11 +58,17 @@ def _settings(model: PPO) -> PPOSettings:
     )
 
 
+def build_ppo_engine(models: Sequence[PPO], compiled: bool) -> PPOEngine:
+    """Make the engine of one model."""
+    (model,) = models
+    return PPOEngine(model, compiled)
+
+
 class PPOEngine:
     """Acts with and updates one policy, whose parameters become views of its tensor.
 
     Args:
-        model: A model for which :func:`why_ppo_unsupported` returns None.
+        model: A PPOFlow model for which :func:`why_ppo_unsupported` returns None.
         compiled: Whether to compile. Where no compiler works, everything runs eagerly, with one
             warning and the same numbers.
     """
@@ -71,6 +77,7 @@ class PPOEngine:
         policy = model.policy
         assert isinstance(policy, DensityActorCritic)
         self.model, self.policy, self.optimizer = model, policy, policy.optimizer
+        self.compiled = compiled
         names = {f"policy.{name}": [value] for name, value in policy.named_parameters()}
         self.flat = FlatParameters([names])
         self.adam = FlatAdam(self.flat, [policy.optimizer])
@@ -82,16 +89,19 @@ class PPOEngine:
         self._act = Compiled(act, "the policy", device)
         self._update.broken = self._act.broken = not compiled
 
-    def fits(self) -> bool:
+    def fits(self, models: Sequence[PPO]) -> bool:
         """Whether the model still has the same policy, optimizer and constants."""
-        same = self.model.policy is self.policy and self.policy.optimizer is self.optimizer
-        return same and self.settings == _settings(self.model)
+        (model,) = models
+        same = model.policy is self.policy and self.policy.optimizer is self.optimizer
+        return same and why_ppo_unsupported(model) is None and self.settings == _settings(model)
 
-    def synchronize(self) -> None:
+    def synchronize(self) -> bool:
         """Take over parameters or optimizer states that were replaced since the last call."""
-        for part in (self.flat, self.adam):
-            if not part.is_bound():
-                part.bind()
+        if self.flat.is_bound() and self.adam.is_bound():
+            return False
+        self.flat.bind()
+        self.adam.bind()
+        return True
 
     def release(self) -> None:
         """Give the policy and its optimizer memory of their own."""

@@ -4,16 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
-from sb3_flowpolicy.engine.engine import Engine, why_unsupported
 
 # Compiling takes 10 to 30 seconds and saves one to five milliseconds per update.
 UPDATES_WORTH_COMPILING = 10_000
 
 
-class EngineRuntime:
+class Bound(Protocol):
+    """What a runtime asks of an engine."""
+
+    compiled: bool
+
+    def fits(self, models: Sequence[Any]) -> bool:
+        """Whether these still are the models, with the same networks, optimizers and constants."""
+
+    def synchronize(self) -> bool:
+        """Take over what was loaded or moved since the last update; return whether anything was."""
+
+    def release(self) -> None:
+        """Give modules and optimizers memory of their own, until :meth:`synchronize`."""
+
+
+BoundT = TypeVar("BoundT", bound=Bound)
+
+
+class EngineRuntime(Generic[BoundT]):
     """The engine of models that learn together.
 
     Between :meth:`running` and its end the models' parameters and optimizer states are views of the
@@ -21,18 +38,27 @@ class EngineRuntime:
     settings meanwhile, so with callbacks the binding is checked before every use; else once.
 
     Args:
-        models: Models that differ only in weights, data and random numbers. Their attributes
-            ``compile`` and ``autocast`` and their method ``objective()`` say how to update them.
+        models: Models that differ only in weights, data and random numbers. Their attribute
+            ``compile`` says whether to compile.
+        why_unsupported: Returns what about a model the engine does not support, if anything.
+        build: Makes an engine of the models; the second argument is whether to compile.
         refuse: Called with a reason when the engine does not support the models.
     """
 
-    def __init__(self, models: Sequence[Any], refuse: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        models: Sequence[Any],
+        why_unsupported: Callable[[Any], str | None],
+        build: Callable[[Sequence[Any], bool], BoundT],
+        refuse: Callable[[str], None],
+    ) -> None:
         self.models = models
+        self._why_unsupported, self._build = why_unsupported, build
         # Number of updates of the models before their first call of ``learn``, and after this one.
         self._first: int | None = None
         self._last = 0.0
         self._refuse = refuse
-        self._engine: Engine | None = None
+        self._engine: BoundT | None = None
         self._running = self._checked = self._refused = False
         self._watched = True
 
@@ -50,13 +76,13 @@ class EngineRuntime:
         # Many short calls of ``learn``, with tests in between, repay compiling as a long one does.
         return self._last - (self._first or 0) >= UPDATES_WORTH_COMPILING
 
-    def plan(self, updates: float) -> None:
+    def plan(self, done: int, updates: float) -> None:
         """Note that a call of ``learn`` begins.
 
         Args:
+            done: Number of updates that the models have done.
             updates: Number of updates that it is going to do.
         """
-        done = self.models[0]._n_updates
         self._first = done if self._first is None else self._first
         self._last = done + updates
 
@@ -85,7 +111,7 @@ class EngineRuntime:
             if self._engine is not None:
                 self._engine.release()
 
-    def engine(self) -> Engine | None:
+    def engine(self) -> BoundT | None:
         """Return the engine, bound to the models as they are now; None if it does not support them.
 
         To be called within :meth:`running`.
@@ -98,22 +124,18 @@ class EngineRuntime:
         engine = self._engine
         if engine is not None:
             # What was compiled once is kept: eager updates would be slower.
-            same = (
-                (engine.compiled or not self.compiles)
-                and engine.autocast == self.models[0].autocast
-                and engine.fits(self.models)
-            )
+            same = (engine.compiled or not self.compiles) and engine.fits(self.models)
             if same and not engine.synchronize():
                 return engine
             if not same:
                 self.drop()
-        reason = why_unsupported(self.models[0])
+        reason = self._why_unsupported(self.models[0])
         if reason is not None:
             self.drop()
             self._refused = True
             self._refuse(reason)
         elif self._engine is None:
-            self._engine = Engine(self.models, self.compiles, self.models[0].autocast)
+            self._engine = self._build(self.models, self.compiles)
         return self._engine
 
     def drop(self) -> None:

@@ -1,6 +1,5 @@
 """The PPO engine does what SB3's loop does."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from stable_baselines3.common.utils import set_random_seed
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import PPOFlow
-from sb3_flowpolicy.algorithms import ppo_flow
 from sb3_flowpolicy.engine.ppo_engine import PPOEngine, why_ppo_unsupported
 
 # 150 steps leave a minibatch of 22 at the end of each epoch.
@@ -132,26 +130,18 @@ class _FreezeOnce(BaseCallback):
         return True
 
 
-@pytest.fixture
-def eager_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compiling would only take time."""
-    monkeypatch.setattr(ppo_flow, "PPOEngine", partial(PPOEngine, compiled=False))
-
-
-@pytest.mark.usefixtures("eager_engine")
 def test_the_engine_steps_aside_for_what_it_does_not_support() -> None:
-    model = PPOFlow("GaussPolicy", ENV, compile=True, **SMALL)
-    model._bound_engine()
-    assert model._engine is not None
-    model.learn(300, callback=_FreezeOnce())
+    model = PPOFlow("GaussPolicy", ENV, compile=False, **SMALL).learn(150)
+    assert model._runtime._engine is not None
+    with pytest.warns(UserWarning, match="does not do parameters that are frozen or have hooks"):
+        model.learn(300, callback=_FreezeOnce())
     assert why_ppo_unsupported(model) == "parameters that are frozen or have hooks"
-    assert model._engine is None
-    assert model._n_updates == 4
+    assert model._runtime._engine is None
+    assert model._n_updates == 6
 
 
-@pytest.mark.usefixtures("eager_engine")
 def test_the_policy_owns_its_memory_after_learning(tmp_path: Path) -> None:
-    model = PPOFlow("GaussPolicy", ENV, compile=True, **SMALL).learn(150)
+    model = PPOFlow("GaussPolicy", ENV, compile=False, **SMALL).learn(150)
     storages = {p.untyped_storage().data_ptr() for p in model.policy.parameters()}
     assert len(storages) == len(list(model.policy.parameters()))
     model.save(tmp_path / "model.zip")
