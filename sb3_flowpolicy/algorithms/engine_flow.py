@@ -90,13 +90,13 @@ class EngineFlow(OffPolicyFlow):
         it, too, if they evaluate as many environments at once as the model learns from.
         """
         is_base = not deterministic or getattr(self.policy, "deterministic_mode", "base") == "base"
-        if is_base and self._runtime.is_running and isinstance(observation, np.ndarray):
+        if is_base and self._runtime.is_running and isinstance(observation, np.ndarray | dict):
             engine = self._runtime.engine()
             if engine is not None and engine.compiled:
                 obs, is_batch = self.policy.obs_to_tensor(observation)
-                assert isinstance(obs, th.Tensor)
                 check_observation(observation)
-                scaled = self._act_compiled(engine, obs, deterministic)
+                rows = engine.networks.observations.pack(obs)
+                scaled = self._act_compiled(engine, rows, deterministic)
                 if scaled is not None:
                     check_finite(scaled)
                     actions = self.policy.unscale_action(scaled)
@@ -130,8 +130,7 @@ class EngineFlow(OffPolicyFlow):
             engine = self._runtime.engine()
         if engine is None or not engine.compiled:
             return super()._sample_action(random_steps, action_noise, n_envs)
-        # What SB3 does, without finding out again that the observation is an array.
-        obs = th.as_tensor(self._last_obs, device=self.device)
+        obs = engine.networks.observations.pack(self._last_obs, self.device)
         noise = self._exploration.next()
         if noise is not None:
             noise = noise.to(engine.networks.actor.data).unsqueeze(0)

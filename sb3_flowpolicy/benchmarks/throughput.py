@@ -22,6 +22,7 @@ GROUPS = {
     "updates": "updates",
     "tqc": "tqc",
     "learn": "learning",
+    "her": "her",
     "environments": "environments",
     "trust": "trust",
     "flow": "flows",
@@ -35,6 +36,7 @@ Measure the speed of sb3_flowpolicy and of its baselines on this machine.
   tqc           gradient updates per second of TQCFlow against sb3-contrib's TQC
   learn         environment steps per second of learn(): SACFlow on TunnelDiagonal-v0 and PPOFlow
                 on Pendulum-v1 against SB3's
+  her           the same with hindsight experience replay and dictionary observations
   environments  steps per second of the environments, single and in batches of 64
   trust         calls of predict per second in each deterministic_mode, 64 actions to choose from
   flow          RealNVP forward and backward against zuko's

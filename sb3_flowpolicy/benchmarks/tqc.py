@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Callable
 from typing import Any
 
-from sb3_contrib import TQC
-
-from sb3_flowpolicy.algorithms.tqc_flow import TQCFlow
 from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
 from sb3_flowpolicy.benchmarks.updates import POLICIES, Shape, prefilled, updates_of
 
@@ -20,13 +18,18 @@ def benchmarks(quick: bool = False) -> list[Benchmark]:
 
 
 def _benchmark(shape: Shape, compile: bool) -> Benchmark:
-    def updates(algorithm: Any, policy: str, **kwargs: Any) -> Callable[[], Work]:
-        sizes = shape.policy_kwargs(policy)
-        # One call, as sb3-contrib's updates take long.
-        return lambda: updates_of(
-            prefilled(algorithm, shape, policy=policy, policy_kwargs=sizes, **kwargs), n_calls=1
-        )
+    def updates(name: str, policy: str, **kwargs: Any) -> Callable[[], Work]:
+        def prepare() -> Work:
+            algorithm = pkgutil.resolve_name(name)  # needs the extra [contrib]
+            sizes = shape.policy_kwargs(policy)
+            model = prefilled(algorithm, shape, policy=policy, policy_kwargs=sizes, **kwargs)
+            return updates_of(model, n_calls=1)  # as sb3-contrib's updates take long
 
-    stock = Candidate("sb3-contrib TQC", updates(TQC, "MlpPolicy"))
-    ours = [Candidate(f"TQCFlow {p}", updates(TQCFlow, p, compile=compile)) for p in POLICIES]
+        return prepare
+
+    stock = Candidate("sb3-contrib TQC", updates("sb3_contrib:TQC", "MlpPolicy"))
+    ours = [
+        Candidate(f"TQCFlow {policy}", updates("sb3_flowpolicy:TQCFlow", policy, compile=compile))
+        for policy in POLICIES
+    ]
     return Benchmark(f"TQC, {shape.title}", "updates", [stock, *ours])

@@ -13,6 +13,7 @@ from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.engine.networks import StackedNetworks
+from sb3_flowpolicy.engine.observations import why_space_unsupported
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
 from sb3_flowpolicy.engine.update import (
     Batch,
@@ -38,8 +39,9 @@ def why_unsupported(model: Any) -> str | None:
         return f"actor of type {type(policy.actor).__name__}"
     if type(policy.critic) is not model.objective().critic_type:
         return f"critic of type {type(policy.critic).__name__}"
-    if not isinstance(model.observation_space.shape, tuple) or model.observation_space.shape == ():
-        return f"observation space {model.observation_space}"
+    reason = why_space_unsupported(model.observation_space)
+    if reason is not None:
+        return reason
     if any(True for _ in policy.critic_target.features_extractor.parameters()):
         return "features extractor with parameters"
     for module in policy.modules():
@@ -271,10 +273,8 @@ class Engine:
             noise = th.randn(shape, dtype=data.dtype, device=data.device)
             return self._rows.take(index, self.models[0].gamma, noise)
         columns = [
-            sample_columns(
-                buffer, n_updates, batch_size, model.gamma, model.get_vec_normalize_env()
-            )
-            for model, buffer in zip(self.models, buffers, strict=True)
+            sample_columns(model, self.networks.observations, n_updates, batch_size)
+            for model in self.models
         ]
         stacked = [th.cat(parts, dim=1) for parts in zip(*columns, strict=True)]
         noise = th.randn(shape, dtype=data.dtype, device=data.device)

@@ -10,24 +10,27 @@ from torch import nn
 from torch.func import functional_call, vmap
 
 from sb3_flowpolicy.engine.flat import FlatParameters, Layout
+from sb3_flowpolicy.engine.observations import Observations
 from sb3_flowpolicy.policies import FlowActor
 
 
 class _ActionLogProb(nn.Module):
     """Samples and scores in ``forward``, which is what ``functional_call`` calls."""
 
-    def __init__(self, actor: FlowActor) -> None:
+    def __init__(self, actor: FlowActor, observations: Observations) -> None:
         super().__init__()
         self.actor = actor
+        self.observations = observations
 
     def forward(self, obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return self.actor.action_log_prob(obs, noise)
+        return self.actor.action_log_prob(self.observations.unpack(obs), noise)
 
 
 class StackedNetworks:
     """The networks of S policies that differ in nothing but their weights.
 
-    Its functions take the parameters of any number of them.
+    Its functions take the parameters of any number of them, and observations as
+    :class:`~sb3_flowpolicy.engine.observations.Observations` packs them.
 
     Args:
         policies: S policies with a :class:`FlowActor` and parameter-free features extractors.
@@ -44,7 +47,8 @@ class StackedNetworks:
             [_critic_layout(policy.critic_target) for policy in policies], True
         )
         self.noise_dim = first.actor.density.noise_dim
-        self._sampler = _ActionLogProb(first.actor)
+        self.observations = Observations(first.observation_space)
+        self._sampler = _ActionLogProb(first.actor, self.observations)
         self._critic = first.critic
 
     def sample(
@@ -88,7 +92,8 @@ class StackedNetworks:
             Values or quantiles, (S, C, B, Q).
         """
         extractor = self._critic.features_extractor
-        features = self._critic.extract_features(obs.flatten(0, 1), extractor)
+        rows = self.observations.unpack(obs.flatten(0, 1))
+        features = self._critic.extract_features(rows, extractor)
         features = features.unflatten(0, obs.shape[:2])
         hidden = th.cat([features, actions], dim=-1).unsqueeze(1)
         parameters = self.critic.unflatten(critic)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_flowpolicy.engine.observations import Observations
 from sb3_flowpolicy.engine.update import Batch
 
 # A column is an attribute of SB3's buffer; a row holds one transition, in this order.
@@ -115,37 +118,48 @@ def draw_index(buffers: Sequence[ReplayBuffer], n_updates: int, batch_size: int)
 
 
 def sample_columns(
-    buffer: ReplayBuffer,
-    n_updates: int,
-    batch_size: int,
-    gamma: float,
-    env: VecNormalize | None = None,
+    model: Any, observations: Observations, n_updates: int, batch_size: int
 ) -> list[th.Tensor]:
-    """Let a buffer sample, once for all updates: n-step, HER, VecNormalize, ...
+    """Let a model's buffer sample, once for all updates: n-step, HER, VecNormalize, ...
 
     Args:
-        buffer: SB3's replay buffer, not empty.
+        model: SB3's algorithm; its replay buffer is not empty.
+        observations: Packs observations.
         n_updates: Number of minibatches.
         batch_size: Transitions per minibatch.
-        gamma: Discount factor, where the buffer does not bring its own.
-        env: ``VecNormalize`` that normalizes observations and rewards.
 
     Returns:
         The fields of :class:`Batch` except the noise, each (n_updates, 1, batch_size, ...).
     """
-    samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
+    buffer, env = model.replay_buffer, model.get_vec_normalize_env()
+    with _filled_rows_only(buffer):
+        samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
     discounts = samples.discounts
     if discounts is None:
-        discounts = th.full_like(samples.rewards, gamma)
+        discounts = th.full_like(samples.rewards, model.gamma)
     columns = (
-        samples.observations,
+        observations.pack(samples.observations),
         samples.actions,
-        samples.next_observations,
+        observations.pack(samples.next_observations),
         samples.dones.squeeze(-1),
         samples.rewards.squeeze(-1),
         discounts.squeeze(-1),
     )
     return [column.unflatten(0, (n_updates, 1, batch_size)) for column in columns]
+
+
+@contextmanager
+def _filled_rows_only(buffer: ReplayBuffer) -> Iterator[None]:
+    """Hide the empty rows from HER's buffer, which would search all of them for episodes."""
+    if not isinstance(buffer, HerReplayBuffer):
+        yield
+        return
+    lengths = buffer.ep_length
+    buffer.ep_length = lengths[: buffer.size()]
+    try:
+        yield
+    finally:
+        buffer.ep_length = lengths
 
 
 @lru_cache(maxsize=8)

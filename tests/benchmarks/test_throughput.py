@@ -10,20 +10,20 @@ import torch as th
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.benchmarks import environments, flows, learning, tqc, trust, updates
+from sb3_flowpolicy.benchmarks import environments, flows, her, learning, tqc, trust, updates
 from sb3_flowpolicy.benchmarks.learning import stock_block, zoo_block
 from sb3_flowpolicy.benchmarks.throughput import GROUPS, main
 from sb3_flowpolicy.benchmarks.updates import products_alone
 from sb3_flowpolicy.engine import Engine
 
-MODULES = (updates, tqc, learning, environments, trust, flows)
+MODULES = (updates, tqc, learning, her, environments, trust, flows)
 
 
 def test_quick_run_writes_the_documented_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "quick.json"
-    groups = ["learn", "environments", "trust", "flow"]
+    groups = ["learn", "her", "environments", "trust", "flow"]
     only = [word for group in groups for word in ("--only", group)]
     main(["--quick", "--json", str(path), *only])
     result = json.loads(path.read_text())
