@@ -8,8 +8,9 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
 
-# Compiling takes 10 to 30 seconds and saves one to five milliseconds per update.
-UPDATES_WORTH_COMPILING = 10_000
+# Compiling repays itself after 1500 to 5000 updates, whatever the width and the number of seeds:
+# both its time and what it saves per update grow with them (docs/engine.md).
+UPDATES_WORTH_COMPILING = 5000
 
 
 class Bound(Protocol):
