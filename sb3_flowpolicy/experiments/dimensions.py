@@ -1,0 +1,263 @@
+r"""`python -m sb3_flowpolicy.experiments.dimensions`: the diagonal tunnel as dimensions grow.
+
+A tunnel of fixed width becomes impossible to enter: the probability that independent noise stays
+inside falls exponentially with the number of coupled dimensions. :data:`WIDTHS` therefore keeps the
+probability that a uniformly random first step survives. At that width, the command predicts the
+highest entropy that a family of policies can hold while it survives a step with a given
+probability.
+
+An action :math:`a \in [-1, 1]^D` at the center line survives if
+
+.. math:: \lVert a - \bar a \mathbf 1 \rVert \le \rho = \frac{w}{2 r},
+
+with the mean :math:`\bar a` of its coordinates, the width :math:`w` and the reach :math:`r`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowpolicy_envs.registration import TUNNEL_IDS
+from sb3_flowpolicy.common.command_line import HelpFormatter, check_folder_of
+
+WIDTHS = {
+    2: 0.0175,
+    3: 0.0752,
+    4: 0.1331,
+    6: 0.2280,
+    8: 0.3034,
+    12: 0.4208,
+    16: 0.5144,
+    32: 0.7941,
+}
+"""Width of the tunnel by number of coupled dimensions, world units. That of two dimensions is the
+registered one; the others let as large a share of uniformly random first steps survive."""
+
+REACH: float = TUNNEL_IDS["TunnelDiagonal-v0"]["reach"]
+
+SURVIVAL_OF_RANDOM_STEPS = 1.0 - (1.0 - WIDTHS[2] / (2.0 * math.sqrt(2.0) * REACH)) ** 2
+"""Share of uniformly random first steps that survive with two dimensions, 8.6 %."""
+
+_SAMPLES = 20_000
+_COMMON_SCALES = (*np.geomspace(0.02, 2.0, 24), *np.geomspace(2.2, 6.0, 6))
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(200)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The best policy of a family at the center of the tunnel.
+
+    Attributes:
+        entropy: Its entropy, nats.
+        progress: Standard deviation of the mean coordinate of an action, the progress along the
+            tunnel as a share of the reach.
+        scale: Standard deviation of each coordinate's own noise before tanh.
+        common: Standard deviation of the noise that all coordinates share, before tanh.
+    """
+
+    entropy: float
+    progress: float
+    scale: float
+    common: float
+
+
+def random_survival(dims: int, width: float, samples: int = 10**6, seed: int = 0) -> float:
+    """Estimate the probability that a uniformly random first step stays in the tunnel.
+
+    Args:
+        dims: Number of coupled dimensions D, at least 2.
+        width: Width of the tunnel, world units.
+        samples: Number of random steps.
+        seed: Seed of these.
+
+    Example:
+        >>> round(random_survival(2, WIDTHS[2]), 2)
+        0.09
+    """
+    rng, inside = np.random.default_rng(seed), 0
+    for count in _portions(samples, dims):
+        inside += int((_offset(rng.uniform(-1.0, 1.0, (count, dims))) <= _radius(width)).sum())
+    return inside / samples
+
+
+def width_for(dims: int, samples: int = 10**6, seed: int = 0) -> float:
+    """Estimate the width at which as many random first steps survive as with two dimensions.
+
+    Args:
+        dims: Number of coupled dimensions D, at least 2.
+        samples: Number of random steps.
+        seed: Seed of these.
+
+    Example:
+        >>> round(width_for(2), 3)
+        0.017
+    """
+    rng = np.random.default_rng(seed)
+    parts = [_offset(rng.uniform(-1.0, 1.0, (n, dims))) for n in _portions(samples, dims)]
+    return 2.0 * REACH * float(np.quantile(np.concatenate(parts), SURVIVAL_OF_RANDOM_STEPS))
+
+
+def bound(dims: int, survival: float) -> float:
+    r"""Return the highest entropy of any density that survives a step with this probability.
+
+    In nats. That density is uniform inside the tunnel, and uniform outside:
+
+    .. math:: D \ln 2 + p \ln \frac{q}{p} + (1 - p) \ln \frac{1 - q}{1 - p}
+
+    with the probability p of surviving, and that of a uniformly random step, q. As q does not
+    depend on D here, neither does the distance to the entropy of the uniform distribution.
+
+    Example:
+        >>> round(bound(2, 0.9) - 2 * np.log(2), 2) == round(bound(32, 0.9) - 32 * np.log(2), 2)
+        True
+    """
+    q = SURVIVAL_OF_RANDOM_STEPS
+    inside = survival * math.log(q / survival)
+    outside = (1.0 - survival) * math.log((1.0 - q) / (1.0 - survival)) if survival < 1.0 else 0.0
+    return dims * math.log(2.0) + inside + outside
+
+
+def independent(dims: int, width: float, survival: float, seed: int = 0) -> Prediction:
+    """Return the best policy whose coordinates are independent squashed normals.
+
+    Args:
+        dims: Number of coupled dimensions D, at least 2.
+        width: Width of the tunnel, world units.
+        survival: Probability with which a step survives, in (0, 1).
+        seed: Seed of the estimate.
+    """
+    return _best(dims, width, survival, (0.0,), seed)
+
+
+def correlated(dims: int, width: float, survival: float, seed: int = 0) -> Prediction:
+    """Return the best policy whose coordinates are squashed normals with common noise.
+
+    The coordinates can be exchanged, so the best covariance that treats them alike is a multiple of
+    the identity plus common noise. A low-rank policy of any rank contains it, and so does one with
+    a full covariance: their predictions coincide.
+
+    Args:
+        dims: Number of coupled dimensions D, at least 2.
+        width: Width of the tunnel, world units.
+        survival: Probability with which a step survives, in (0, 1).
+        seed: Seed of the estimate.
+    """
+    return _best(dims, width, survival, (0.0, *_COMMON_SCALES), seed)
+
+
+def _best(
+    dims: int, width: float, survival: float, commons: Sequence[float], seed: int
+) -> Prediction:
+    rng = np.random.default_rng(seed)
+    shared, own = rng.standard_normal((_SAMPLES, 1)), rng.standard_normal((_SAMPLES, dims))
+    candidates = []
+    for common in commons:
+        scale = _widest(common * shared, own, width, survival)
+        if scale > 0.0:
+            actions = np.tanh(common * shared + scale * own)
+            progress = float(actions.mean(axis=1).std())
+            entropy = _entropy(dims, scale, common)
+            candidates.append(Prediction(entropy, progress, scale, float(common)))
+    return max(candidates, key=lambda one: one.entropy)
+
+
+def _widest(
+    shared: NDArray[np.float64], own: NDArray[np.float64], width: float, survival: float
+) -> float:
+    """Return the largest scale of `own` (N, D) that survives, by bisection of its logarithm.
+
+    The search ends where the entropy of a squashed coordinate falls again.
+    """
+    low, high = math.log(1e-4), math.log(0.88)
+    for _ in range(18):
+        middle = (low + high) / 2.0
+        offsets = _offset(np.tanh(shared + math.exp(middle) * own))
+        survives = (offsets <= _radius(width)).mean() >= survival
+        low, high = (middle, high) if survives else (low, middle)
+    return math.exp(low)
+
+
+def _entropy(dims: int, scale: float, common: float) -> float:
+    """Return the entropy of tanh(common z 1 + scale e) with standard normal z and e (D,), nats."""
+    normal = dims * (0.5 * math.log(2.0 * math.pi * math.e) + math.log(scale))
+    normal += 0.5 * math.log1p(dims * (common / scale) ** 2)
+    size = np.abs(math.hypot(scale, common) * _NODES)
+    log_slope = 2.0 * (math.log(2.0) - size - np.log1p(np.exp(-2.0 * size)))
+    return normal + dims * float(_WEIGHTS @ log_slope / _WEIGHTS.sum())
+
+
+def _offset(actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distances (N,) of actions (N, D) from the diagonal."""
+    return np.asarray(np.linalg.norm(actions - actions.mean(axis=1, keepdims=True), axis=1))
+
+
+def _radius(width: float) -> float:
+    return width / (2.0 * REACH)
+
+
+def _portions(samples: int, dims: int) -> list[int]:
+    """Split a number of samples so that one portion needs little memory."""
+    most = max(1, 4 * 10**6 // dims)
+    return [most] * (samples // most) + ([samples % most] if samples % most else [])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_flowpolicy.experiments.dimensions",
+        description="Predict the highest entropy of independent and of correlated noise in "
+        "diagonal tunnels whose random first steps survive equally often.",
+        formatter_class=HelpFormatter,
+    )
+    survival = "probability with which a step of the policy survives"
+    parser.add_argument("--survival", type=float, default=0.9, help=survival)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results there")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw them as PNG")
+    args = parser.parse_args(arguments)
+    if not 0.0 < args.survival < 1.0:
+        parser.error(f"--survival must be in (0, 1), got {args.survival}")
+    for name in ("json", "figure"):
+        check_folder_of(parser, f"--{name}", getattr(args, name))
+    print(
+        f"{'D':>3}{'width':>9}{'uniform':>9}{'any density':>13}{'correlated':>12}"
+        f"{'independent':>13}{'gap':>7}{'progress: correlated':>22}{'independent':>13}"
+    )
+    rows = []
+    for dims, width in WIDTHS.items():
+        alone = independent(dims, width, args.survival)
+        joint = correlated(dims, width, args.survival)
+        best, uniform = bound(dims, args.survival), dims * math.log(2.0)
+        print(
+            f"{dims:3d}{width:9.4f}{uniform:9.2f}{best:13.2f}{joint.entropy:12.2f}"
+            f"{alone.entropy:13.2f}{joint.entropy - alone.entropy:7.2f}{joint.progress:22.3f}"
+            f"{alone.progress:13.3f}"
+        )
+        rows.append(
+            {
+                "dims": dims,
+                "width": width,
+                "uniform": uniform,
+                "bound": best,
+                "correlated": asdict(joint),
+                "independent": asdict(alone),
+            }
+        )
+    if args.json is not None:
+        from sb3_flowpolicy.common.files import write_json
+
+        write_json(args.json, {"survival": args.survival, "rows": rows})
+    if args.figure is not None:
+        from sb3_flowpolicy.experiments.dimensions_figure import draw
+
+        args.figure.write_bytes(draw(rows, args.survival))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""Tunnels of many dimensions: widths against the environment, entropy against samples."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.experiments.dimensions import (
+    REACH,
+    SURVIVAL_OF_RANDOM_STEPS,
+    WIDTHS,
+    _entropy,
+    bound,
+    correlated,
+    independent,
+    main,
+    random_survival,
+    width_for,
+)
+
+
+@pytest.mark.parametrize("dims", WIDTHS)
+def test_random_first_steps_survive_equally_often(dims):
+    assert random_survival(dims, WIDTHS[dims], 200_000) == pytest.approx(
+        SURVIVAL_OF_RANDOM_STEPS, abs=0.003
+    )
+
+
+def test_two_dimensions_are_the_registered_tunnel():
+    config = gym.make("TunnelDiagonal-v0").unwrapped.config
+    assert (config.width, config.reach) == (WIDTHS[2], REACH)
+    assert width_for(2, 200_000) == pytest.approx(WIDTHS[2], rel=0.02)
+
+
+def test_survival_is_that_of_the_environment():
+    count = 4000
+    envs = gym.make_vec(
+        "TunnelDiagonal-v0",
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        total_dims=8,
+        coupled_dims=8,
+        width=WIDTHS[8],
+    )
+    envs.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1, 1, (count, 8)).astype(np.float32)
+    *_, terminated, _, _ = envs.step(actions)
+    assert 1 - terminated.mean() == pytest.approx(SURVIVAL_OF_RANDOM_STEPS, abs=0.015)
+
+
+def test_entropy_is_that_of_squashed_noise():
+    scale, common = 0.4, 0.7
+    noise = np.random.default_rng(0).standard_normal((200_000, 4))
+    latent = common * noise[:, :1] + scale * noise[:, 1:]
+    covariance = common**2 + scale**2 * np.eye(3)
+    normal = 0.5 * np.linalg.slogdet(2 * np.pi * np.e * covariance)[1]
+    expected = normal + np.log(1 - np.tanh(latent) ** 2).sum(axis=1).mean()
+    assert _entropy(3, scale, common) == pytest.approx(expected, abs=0.02)
+
+
+def test_independent_noise_in_two_dimensions_is_as_computed_by_hand():
+    # The difference of two coordinates is normal, and 90 % of it within 1.645 deviations.
+    scale = WIDTHS[2] / (2 * REACH) / 1.645
+    found = independent(2, WIDTHS[2], 0.9)
+    assert found.entropy == pytest.approx(2 * np.log(scale * np.sqrt(2 * np.pi * np.e)), abs=0.05)
+
+
+def test_correlation_is_worth_less_in_more_dimensions():
+    gaps = []
+    for dims in (2, 4, 8):
+        alone, joint = (one(dims, WIDTHS[dims], 0.9) for one in (independent, correlated))
+        assert alone.entropy < joint.entropy < bound(dims, 0.9)
+        assert alone.progress < joint.progress
+        gaps.append(joint.entropy - alone.entropy)
+    assert gaps[0] > 2 * gaps[1] > 2 * gaps[2] > 0.5
+
+
+def test_the_command_writes_what_it_prints(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(
+        "sb3_flowpolicy.experiments.dimensions.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
+    )
+    main(["--json", str(tmp_path / "p.json"), "--figure", str(tmp_path / "p.png")])
+    rows = json.loads((tmp_path / "p.json").read_text())["rows"]
+    assert [row["dims"] for row in rows] == [2, 3]
+    assert f"{rows[0]['independent']['entropy']:.2f}" in capsys.readouterr().out
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_refuses_a_certain_survival(capsys):
+    with pytest.raises(SystemExit):
+        main(["--survival", "1"])
+    assert "--survival must be in (0, 1), got 1.0" in capsys.readouterr().err
