@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import yaml
 
 from sb3_flowpolicy.common.validation import integer
 
@@ -39,6 +40,19 @@ def at_least(least: int) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(str(error)) from None
 
     return convert
+
+
+def assignment(text: str) -> tuple[str, Any]:
+    """Type for argparse: ``NAME=VALUE`` with a YAML value.
+
+    Example:
+        >>> assignment("width=0.1")
+        ('width', 0.1)
+    """
+    name, sign, value = text.partition("=")
+    if not name or not sign:
+        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
+    return name, yaml.safe_load(value)
 
 
 def check_folder_of(parser: argparse.ArgumentParser, option: str, path: Path | None) -> None:

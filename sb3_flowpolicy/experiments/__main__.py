@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from sb3_flowpolicy.common.command_line import HelpFormatter, at_least
+from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
 from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
@@ -22,6 +22,7 @@ from sb3_flowpolicy.experiments.work import (
     in_words,
     make_plan,
     plan_seconds,
+    vary,
 )
 
 OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")}
@@ -79,7 +80,7 @@ def _list(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    experiment = find(args.name)
+    experiment = vary(find(args.name), dict(args.set), args.agents)
     missing = what_is_missing(experiment)
     if missing:
         raise ValueError(f"{experiment.name} needs {missing}, which is not installed")
@@ -150,6 +151,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--first-seed", type=at_least(0), default=FIRST_SEED, help=first)
     steps = f"steps per seed (default: the experiment's; quick: {QUICK_STEPS})"
     add("--steps", type=count, help=steps)
+    add("--agents", nargs="+", metavar="AGENT", help="only these agents")
+    values = "arguments of all environments, for tuning (YAML values)"
+    add("--set", nargs="*", type=assignment, default=[], metavar="ARG=VALUE", help=values)
     add("--backend", choices=("local", "ray"), default="local", help="where to run")
     add("--address", help="Ray cluster to join, 'auto' for the one this machine is in")
     outs = " or ".join(map(str, OUT.values()))

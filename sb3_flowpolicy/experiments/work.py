@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -101,6 +101,33 @@ class Plan:
             "seeds": list(self.seeds),
             "items": {item.key: describe(item) for item in self.items},
         }
+
+
+def vary(
+    experiment: Experiment, env_kwargs: Mapping[str, Any], agents: Sequence[str] | None = None
+) -> Experiment:
+    """Return an experiment with other environments or fewer agents, for tuning.
+
+    Args:
+        experiment: The experiment.
+        env_kwargs: Arguments of the environments, in all settings.
+        agents: Names of the agents to keep. Default: all.
+
+    Raises:
+        ValueError: If there is no such agent.
+    """
+    names = [agent.name for agent in experiment.agents]
+    for name in agents or ():
+        if name not in names:
+            raise ValueError(f"agents of {experiment.name} must be among {names}, got {name!r}")
+    return replace(
+        experiment,
+        agents=tuple(one for one in experiment.agents if agents is None or one.name in agents),
+        settings=tuple(
+            replace(setting, env_kwargs={**setting.env_kwargs, **env_kwargs})
+            for setting in experiment.settings
+        ),
+    )
 
 
 def make_plan(

@@ -52,10 +52,25 @@ def test_a_run_leaves_results_and_is_not_repeated(
     assert {path.name: path.read_bytes() for path in folder.glob("*.csv")} == tables
 
 
+def test_tuning_changes_the_environment_and_leaves_agents_out(
+    tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", "tiny", "--first-seed", "100", "--seeds", "1", "--steps", "60"]
+    command += ["--agents", "gauss", "--set", "dense_reward=0.2", "width=0.5"]
+    assert main([*command, "--out", str(tmp_path), "--workers", "1", "--no-progress"]) == 0
+    items = json.loads((tmp_path / "tiny" / "settings.json").read_text())["items"]
+    assert list(items) == ["circle-gauss"]
+    assert items["circle-gauss"]["env_kwargs"] == {"dense_reward": 0.2, "width": 0.5}
+    with pytest.raises(SystemExit, match="2"):
+        main(["run", "tiny", "--set", "width"])
+    assert "must be NAME=VALUE, got 'width'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["sparse-fixed-alfa"], "did you mean 'sparse-fixed-alpha'"),
+        (["tiny", "--agents", "flow", "lr"], "agents of tiny must be among ['gauss', 'flow'], got"),
         (["tiny", "--address", "auto"], "--address needs --backend ray, got 'local'"),
     ],
 )

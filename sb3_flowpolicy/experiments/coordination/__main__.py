@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from sb3_flowpolicy.common.command_line import check_folder_of
+from sb3_flowpolicy.common.command_line import assignment, check_folder_of
 
 _DESCRIPTION = """\
 Predict, without training, how much an agent gains from noise that correlates between fingers.
@@ -61,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     add = parser.add_argument
     add("env", metavar="ID", help="id of a Square, for example SquareMoveX-v1")
-    pairs: dict[str, Any] = {"nargs": "*", "type": _assignment, "default": []}
+    pairs: dict[str, Any] = {"nargs": "*", "type": assignment, "default": []}
     add("--set", metavar="ARG=VALUE", help="arguments of the environment (YAML values)", **pairs)
     add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **pairs)
     add("--ent-coef", type=float, default=0.05, help="entropy coefficient (default: 0.05)")
@@ -122,13 +120,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.json is not None:
         told = {name: vars(row) for name, row in found.items()}
         write_json(args.json, {"settings": _told(args), "families": told})
-
-
-def _assignment(text: str) -> tuple[str, Any]:
-    name, sign, value = text.partition("=")
-    if not name or not sign:
-        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
-    return name, yaml.safe_load(value)
 
 
 def _told(args: argparse.Namespace) -> dict[str, Any]:
