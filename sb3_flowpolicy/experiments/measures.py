@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium.vector import VectorEnv
 
+from flowpolicy_envs.tunnel.paths import Path
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.policies import FlowActor
@@ -137,8 +138,7 @@ def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[fl
     if config is None or not hasattr(config, "geometry"):
         return None
     way = np.arange(PROFILE_POINTS) / PROFILE_POINTS
-    arcs = way * config.geometry.goal_arcs[0]
-    points = np.stack([config.geometry.point(arc) for arc in arcs])
+    points = np.stack([config.geometry.point(arc) for arc in way * _arc_to_goal(config.geometry)])
     if config.path == "circle":
         radius = np.full(len(points), config.radius)
         points = np.column_stack([points, radius, np.linalg.norm(points, axis=1)])
@@ -146,6 +146,13 @@ def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[fl
     with own_random_numbers(seed, model.num_timesteps, 3):
         entropy = model.actor.entropy(th.as_tensor(points.astype(np.float32)), PROFILE_SAMPLES)
     return {"way": _rounded(way), "entropy": _rounded(entropy.numpy())}
+
+
+def _arc_to_goal(path: Path) -> float:
+    """Return the signed arc from the start to the goal region, along the shorter way."""
+    length = path.locate(path.point(0.0))[1]
+    ahead = path.locate(path.point(length / PROFILE_POINTS))[1]
+    return length if ahead < length else -length
 
 
 def policy_picture(model: SACFlow, env_id: str, seed: int) -> dict[str, Any] | None:
