@@ -142,14 +142,14 @@ def slower(setting: str, slow: Agent, others: Sequence[Agent]) -> Check:
 
 
 def front_loads(setting: str, agent: Agent, than: Agent, margin: float) -> Check:
-    """Check that an agent has more entropy at the first steps than on average along the way.
+    """Check that an agent has more entropy at the start than on average along the way.
 
     The agent meets an entropy target where that costs least: a step that fails at the start loses
     little. Every episode passes through the start, so these states are frequent, too.
 
     Args:
         setting: The setting.
-        agent: The agent that is claimed to spend its entropy at the first steps.
+        agent: The agent that is claimed to spend its entropy at the start.
         than: The agent that is claimed to do so less.
         margin: Least difference between the two, nats.
     """
@@ -162,8 +162,8 @@ def front_loads(setting: str, agent: Agent, than: Agent, margin: float) -> Check
         return Finding(holds, f"{agent.label} {a:.2f} nats; {than.label} {b:.2f} nats")
 
     return Check(
-        f"{setting}: entropy on the first sixth of the way less the mean along the way (IQM) is "
-        f"above 0 for {agent.label}, and at least {margin:g} nats more than for {than.label}",
+        f"{setting}: entropy at the start less the mean along the way (IQM) is above 0 for "
+        f"{agent.label}, and at least {margin:g} nats more than for {than.label}",
         test,
     )
 

@@ -34,9 +34,6 @@ _ROUNDING = 1e-9
 # Consecutive evaluations that count for "at its best" and for "steps until solved".
 IN_A_ROW = 3
 
-FIRST_STEPS = 1 / 6
-"""The share of the way that counts as the first steps: the first of at least six on the circle."""
-
 OSCILLATIONS = {"train_return": 0.25, "entropy": 1.0, "log_ent_coef": 0.1}
 """What counts as a swing: a quarter of the best test return, a nat, a tenth of the coefficient."""
 SWINGS_OF_AN_OSCILLATION = 3
@@ -232,12 +229,15 @@ class Evidence:
         return np.array(found[0]["way"]), np.array([one["entropy"] for one in found])
 
     def front_loading(self, setting: str, agent: str) -> np.ndarray:
-        """Return each seed's entropy at the first steps less the mean along the way, (S,)."""
+        """Return each seed's entropy at the start less the mean along the way, (S,).
+
+        Every episode visits the start, and then hardly any state before the end of its first step.
+        """
         profile = self.profile(setting, agent)
         if profile is None:
             raise NotMeasuredError(f"profile of {agent} on {setting}")
-        way, entropy = profile
-        return entropy[:, way < FIRST_STEPS].mean(1) - entropy.mean(1)
+        entropy = profile[1]
+        return entropy[:, 0] - entropy.mean(1)
 
     def pictures(self, setting: str, agent: str) -> list[dict[str, Any]]:
         """Return the recorded policies, in order of steps."""

@@ -13,6 +13,8 @@ EXPECTED = {
     # id: path, coupled dims, reach / width, dense, goal, penalty
     "TunnelCircle-v0": ("circle", 2, 4, 1.0, 0.1, 0.0),
     "TunnelCircleNarrow-v0": ("circle", 2, 5, 1.0, 1.0, 0.0),
+    "TunnelCircle-v1": ("circle", 2, 4, 0.25, 0.1, 0.0),
+    "TunnelCircleNarrow-v1": ("circle", 2, 5, 0.25, 1.0, 0.0),
     "TunnelHorizontal-v0": ("line", 1, 8, 0.0, 1.0, 0.1),
     "TunnelDiagonal-v0": ("line", 2, 8, 0.0, 1.0, 0.1),
     "TunnelSpline-v0": ("spline", 2, 4, 1.0, 1.0, 0.0),

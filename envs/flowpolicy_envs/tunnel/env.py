@@ -124,6 +124,7 @@ class TunnelEnv(BatchEnv):
 
     ## Version History
 
+    * v1 (the two circles): `dense_reward` of 0.25 instead of 1
     * v0: Initial version
     """
 
