@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from sb3_flowpolicy.experiments.checks import at_least_times, ordered, solved
-from sb3_flowpolicy.experiments.dimensions import WIDTHS
+from sb3_flowpolicy.experiments.dimensions.prediction import WIDTHS
 from sb3_flowpolicy.experiments.experiment import (
     FLOW,
     GAUSS,

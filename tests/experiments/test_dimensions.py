@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.experiments.dimensions import (
+from sb3_flowpolicy.experiments.dimensions.__main__ import main
+from sb3_flowpolicy.experiments.dimensions.prediction import (
     REACH,
     SURVIVAL_OF_RANDOM_STEPS,
     WIDTHS,
@@ -15,7 +16,6 @@ from sb3_flowpolicy.experiments.dimensions import (
     bound,
     correlated,
     independent,
-    main,
     random_survival,
     width_for,
 )
@@ -80,7 +80,7 @@ def test_correlation_is_worth_less_in_more_dimensions():
 def test_the_command_writes_what_it_prints(tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(
-        "sb3_flowpolicy.experiments.dimensions.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
+        "sb3_flowpolicy.experiments.dimensions.__main__.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
     )
     main(["--json", str(tmp_path / "p.json"), "--figure", str(tmp_path / "p.png")])
     rows = json.loads((tmp_path / "p.json").read_text())["rows"]

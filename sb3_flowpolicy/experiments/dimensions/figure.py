@@ -20,7 +20,7 @@ def draw(rows: Sequence[Mapping[str, Any]], survival: float) -> bytes:
     """Draw entropy and progress by dimension.
 
     Args:
-        rows: One per number of dimensions, as :mod:`~sb3_flowpolicy.experiments.dimensions` makes.
+        rows: One per number of dimensions, as the command makes.
         survival: Probability with which a step survives.
 
     Returns:

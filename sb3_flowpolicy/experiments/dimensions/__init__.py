@@ -1,0 +1,1 @@
+"""The diagonal tunnel as dimensions grow."""
