@@ -190,8 +190,7 @@ def test_hindsight_replay(tmp_path: Path) -> None:
         return BitFlippingEnv(n_bits=2, continuous=True, max_steps=5)
 
     changes = {"policy": "MultiInputFlowPolicy", "replay_buffer_class": HerReplayBuffer}
-    with pytest.warns(UserWarning, match="SB3's own loop"):
-        assert differences(goal_env, tmp_path, **changes) == []
+    assert differences(goal_env, tmp_path, **changes) == []
 
 
 def test_callbacks_and_their_environments_go_on(tmp_path: Path) -> None:
