@@ -8,8 +8,9 @@ from sb3_contrib import CrossQ
 from sb3_contrib.crossq.policies import CrossQPolicy
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.common.validation import check_settings, flag, integer, number
+from sb3_flowpolicy.engine.crossq import CrossQObjective
 from sb3_flowpolicy.policies import crossq
 
 _NORMALIZATION = {
@@ -20,7 +21,7 @@ _NORMALIZATION = {
 }
 
 
-class CrossQFlow(OffPolicyFlow, CrossQ):
+class CrossQFlow(EngineFlow, CrossQ):
     """CrossQ with action distributions that correlate and bend.
 
     Supports everything that sb3-contrib's :class:`~sb3_contrib.CrossQ` does, with the additions of
@@ -32,8 +33,8 @@ class CrossQFlow(OffPolicyFlow, CrossQ):
             policy class.
         env: Environment, its registered id, or a ``VecEnv``.
         *args: Further arguments of CrossQ, in its order.
-        **kwargs: Keyword arguments of CrossQ, ``action_noise_color`` and
-            ``action_noise_correlation_time``.
+        **kwargs: Keyword arguments of CrossQ, and ``compile``, ``autocast``, ``action_noise_color``
+            and ``action_noise_correlation_time`` of :class:`~sb3_flowpolicy.SACFlow`.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -49,9 +50,13 @@ class CrossQFlow(OffPolicyFlow, CrossQ):
 
     stock = CrossQ
     policy_class_of_stock = CrossQPolicy
-    settings: ClassVar = {**SETTINGS, "policy_delay": integer(1)}
+    settings: ClassVar = {**EngineFlow.settings, "policy_delay": integer(1)}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = crossq.ALIASES
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         check_settings(kwargs.get("policy_kwargs") or {}, _NORMALIZATION)
         super().__init__(*args, **kwargs)
+
+    def objective(self) -> CrossQObjective:
+        """Return CrossQ's objective, with the present ``policy_delay``."""
+        return CrossQObjective(policy_delay=self.policy_delay)

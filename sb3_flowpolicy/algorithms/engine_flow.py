@@ -160,17 +160,22 @@ class EngineFlow(OffPolicyFlow):
                 losses = engine.train(batches, start).tolist()
                 self._n_updates += n_updates
                 self._guard.after_updates(LOSSES, losses, engine.history, batches)
-                self.record_losses(losses)
+                self.record_losses(losses, names=engine.logged)
 
     def _train_with_sb3(self, gradient_steps: int, batch_size: int) -> None:
         """Run the stock algorithm's loop."""
         super().train(gradient_steps, batch_size)
 
-    def record_losses(self, losses: Sequence[Sequence[float]], seed: int = 0) -> None:
+    def record_losses(
+        self,
+        losses: Sequence[Sequence[float]],
+        seed: int = 0,
+        names: Sequence[str] = LOSSES,
+    ) -> None:
         """Record what SB3's ``train`` records: the engine's losses, (4, S), of one seed."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for key, values in zip(LOSSES, losses, strict=True):
-            if key != "ent_coef_loss" or self.ent_coef_optimizer is not None:
+            if key in names and (key != "ent_coef_loss" or self.ent_coef_optimizer is not None):
                 self.logger.record(f"train/{key}", values[seed])
 
     def _planned_updates(self, total_timesteps: int) -> float:

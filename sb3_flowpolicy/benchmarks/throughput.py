@@ -20,7 +20,7 @@ from sb3_flowpolicy.common.machine import machine
 # for the whole process when imported, comes last.
 GROUPS = {
     "updates": "updates",
-    "tqc": "tqc",
+    "contrib": "contrib",
     "learn": "learning",
     "her": "her",
     "environments": "environments",
@@ -33,7 +33,8 @@ Measure the speed of sb3_flowpolicy and of its baselines on this machine.
 
   updates       gradient updates per second (batch 256): SACFlow and ten stacked seeds against
                 SB3's SAC (and SBX where installed) and against the matrix products alone
-  tqc           gradient updates per second of TQCFlow against sb3-contrib's TQC
+  contrib       gradient updates per second of TQCFlow and CrossQFlow against sb3-contrib's TQC
+                and CrossQ
   learn         environment steps per second of learn(): SACFlow on TunnelDiagonal-v0 and PPOFlow
                 on Pendulum-v1 against SB3's
   her           the same with hindsight experience replay and dictionary observations

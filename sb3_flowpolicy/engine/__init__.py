@@ -1,4 +1,4 @@
-"""The updates of SAC, TQC (for one seed or several stacked) and PPO as functions of tensors."""
+"""The updates of SAC, TQC, CrossQ (for one seed or several) and PPO as functions of tensors."""
 
 from sb3_flowpolicy.engine.engine import Engine, build_engine, settings_key, why_unsupported
 from sb3_flowpolicy.engine.runtime import EngineRuntime

@@ -12,15 +12,15 @@ from sb3_flowpolicy.engine.adam import FlatAdam, why_optimizer_unsupported
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
-from sb3_flowpolicy.engine.networks import StackedNetworks
 from sb3_flowpolicy.engine.observations import why_space_unsupported
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
 from sb3_flowpolicy.engine.update import (
+    LOSSES,
     Batch,
     Moments,
+    Objective,
     TrainState,
     UpdateSettings,
-    make_update,
 )
 from sb3_flowpolicy.policies import FlowActor
 
@@ -34,25 +34,28 @@ MODE_DEPENDENT = (
 
 def why_unsupported(model: Any) -> str | None:
     """Return what about a model the engine does not support; None if it supports everything."""
-    policy = model.policy
+    policy, objective = model.policy, model.objective()
     if not isinstance(policy.actor, FlowActor):
         return f"actor of type {type(policy.actor).__name__}"
-    if type(policy.critic) is not model.objective().critic_type:
+    if type(policy.critic) is not objective.critic_type:
         return f"critic of type {type(policy.critic).__name__}"
     reason = why_space_unsupported(model.observation_space)
     if reason is not None:
         return reason
-    if any(True for _ in policy.critic_target.features_extractor.parameters()):
+    if any(True for _ in policy.critic.features_extractor.parameters()):
         return "features extractor with parameters"
     for module in policy.modules():
         if isinstance(module, MODE_DEPENDENT):
             return f"layer of type {type(module).__name__}"
     for network in policy.critic.q_networks:
         for layer in network.children():
-            if not isinstance(layer, nn.Linear) and any(True for _ in layer.parameters()):
+            known = isinstance(layer, objective.layer_types)
+            if not known and any(True for _ in layer.parameters()):
                 return f"critic layer of type {type(layer).__name__}, which has parameters"
-    if any(True for _ in policy.critic.buffers()):
-        return "critic with buffers"
+    for layer in policy.critic.modules():
+        known = isinstance(layer, objective.layer_types)
+        if not known and any(True for _ in layer.buffers(recurse=False)):
+            return "critic with buffers"
     for parameter in (*policy.actor.parameters(), *policy.critic.parameters()):
         if not parameter.requires_grad or parameter._backward_hooks:
             return "parameters that are frozen or have hooks"
@@ -60,7 +63,7 @@ def why_unsupported(model: Any) -> str | None:
         reason = why_optimizer_unsupported(optimizer)
         if reason is not None:
             return reason
-    return None
+    return objective.why_unsupported(policy)
 
 
 def settings_key(model: Any) -> tuple[object, ...]:
@@ -99,7 +102,9 @@ class Engine:
         self.compiled = compiled
         self.autocast = autocast
         first = self.models[0]
-        self.networks = StackedNetworks([model.policy for model in self.models], autocast)
+        self.objective: Objective = first.objective()
+        policies = [model.policy for model in self.models]
+        self.networks = self.objective.networks_type(policies, autocast)
         self.actor_adam = FlatAdam(
             self.networks.actor, [model.policy.actor.optimizer for model in self.models]
         )
@@ -117,7 +122,7 @@ class Engine:
             self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)
         learned = self.ent_coef_adam
         settings = UpdateSettings(
-            objective=first.objective(),
+            objective=self.objective,
             tau=first.tau,
             target_entropy=float(first.target_entropy),
             actor_adam=self.actor_adam.settings,
@@ -127,11 +132,9 @@ class Engine:
         self.settings_key = settings_key(first)
         self._identities = [_identity(model) for model in self.models]
         self._slots = [slot for model in self.models for slot in _slots(model)]
-        self._update = make_update(self.networks, settings)
+        self._update = self.objective.make_update(self.networks, settings)
         device = self.networks.actor.data.device
-        self._compiled_update = Compiled(
-            self._update, f"the {settings.objective.name} update", device
-        )
+        self._compiled_update = Compiled(self._update, f"the {self.objective.name} update", device)
         networks = self.networks
 
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
@@ -139,6 +142,8 @@ class Engine:
 
         #: Losses of each update of the last :meth:`train`, (4, S): to find out which went wrong.
         self.history: list[th.Tensor] = []
+        #: Names of the losses to log of the last :meth:`train`.
+        self.logged: tuple[str, ...] = LOSSES
         self._rows: ReplayRows | None = None
         self._state: TrainState | None = None
         self._grouped: tuple[int, list[tuple[slice, TrainState]]] | None = None
@@ -166,7 +171,7 @@ class Engine:
         )
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
-        parts = [self.networks.actor, self.networks.critic, self.networks.target]
+        parts = [self.networks.actor, self.networks.critic, *self.networks.others]
         return [
             *(part for part in (*parts, self.log_ent_coef) if part is not None),
             self.actor_adam,
@@ -254,7 +259,7 @@ class Engine:
         return TrainState(
             self.networks.actor.data,
             self.networks.critic.data,
-            self.networks.target.data,
+            tuple(part.data for part in self.networks.others),
             ent_coef,
             moments(self.actor_adam),
             moments(self.critic_adam),
@@ -285,7 +290,7 @@ class Engine:
 
         Args:
             batches: As :meth:`draw` returns them, at least one.
-            start: Number of updates done already since the target networks' turn was counted.
+            start: Number of updates done already in the same call of the model's ``train``.
 
         Returns:
             Losses, means over the updates, (4, S); see ``LOSSES``.
@@ -301,26 +306,27 @@ class Engine:
         learning_rates = self._learning_rates[1]
         groups = self._groups(batches[0].rewards.shape[1])
         history = self.history = []
-        for k, batch in enumerate(batches, start):
-            move_target = k % first.target_update_interval == 0
+        flags = [self.objective.is_due(first, k, start) for k in range(len(batches))]
+        for batch, flag in zip(batches, flags, strict=True):
             if len(groups) == 1:
                 state = groups[0][1]
-                history.append(self._update_once(state, batch, learning_rates, move_target))
+                history.append(self._update_once(state, batch, learning_rates, flag))
                 continue
             losses = [
-                self._update_once(part, batch.of(seeds), learning_rates, move_target)
+                self._update_once(part, batch.of(seeds), learning_rates, flag)
                 for seeds, part in groups
             ]
             history.append(th.cat(losses, dim=1))
-        return history[0] if len(history) == 1 else th.stack(history).mean(0)
+        means, self.logged = self.objective.mean_losses(history, sum(flags))
+        return means
 
     def _update_once(
-        self, state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
+        self, state: TrainState, batch: Batch, learning_rates: th.Tensor, flag: bool
     ) -> th.Tensor:
         if not self._runs_compiled():
-            return self._update(state, batch, learning_rates, move_target)
-        key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), move_target)
-        return self._compiled_update(key, state, batch, learning_rates, move_target)
+            return self._update(state, batch, learning_rates, flag)
+        key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), flag)
+        return self._compiled_update(key, state, batch, learning_rates, flag)
 
 
 def _can_be_rows(model: Any) -> bool:
@@ -349,7 +355,8 @@ def _slots(model: Any) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Par
     ``actor.requires_grad_(False)`` for example.
     """
     slots = []
-    for network in (model.actor, model.critic, model.critic_target):
+    targets = [model.critic_target] if hasattr(model, "critic_target") else []
+    for network in (model.actor, model.critic, *targets):
         path, parameter = next(network.named_parameters())
         module, _, name = path.rpartition(".")
         home = network.get_submodule(module)._parameters

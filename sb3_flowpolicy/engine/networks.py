@@ -43,13 +43,16 @@ class StackedNetworks:
         self.autocast = autocast
         self.actor = FlatParameters([_actor_layout(policy) for policy in policies])
         self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies], True)
-        self.target = FlatParameters(
-            [_critic_layout(policy.critic_target) for policy in policies], True
-        )
+        #: What an update changes besides: the target networks.
+        self.others = self._others(policies)
         self.noise_dim = first.actor.density.noise_dim
         self.observations = Observations(first.observation_space)
         self._sampler = _ActionLogProb(first.actor, self.observations)
         self._critic = first.critic
+
+    def _others(self, policies: Sequence[Any]) -> list[FlatParameters]:
+        targets = [_critic_layout(policy.critic_target) for policy in policies]
+        return [FlatParameters(targets, True)]
 
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
@@ -91,11 +94,7 @@ class StackedNetworks:
         Returns:
             Values or quantiles, (S, C, B, Q).
         """
-        extractor = self._critic.features_extractor
-        rows = self.observations.unpack(obs.flatten(0, 1))
-        features = self._critic.extract_features(rows, extractor)
-        features = features.unflatten(0, obs.shape[:2])
-        hidden = th.cat([features, actions], dim=-1).unsqueeze(1)
+        hidden = self._critic_inputs(obs, actions)
         parameters = self.critic.unflatten(critic)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
             for name, layer in self._critic.q_networks[0].named_children():
@@ -105,6 +104,14 @@ class StackedNetworks:
                 else:
                     hidden = layer(hidden)
         return hidden.to(critic.dtype)
+
+    def _critic_inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return features and actions side by side, (S, 1, B, F)."""
+        extractor = self._critic.features_extractor
+        rows = self.observations.unpack(obs.flatten(0, 1))
+        features = self._critic.extract_features(rows, extractor)
+        features = features.unflatten(0, obs.shape[:2])
+        return th.cat([features, actions], dim=-1).unsqueeze(1)
 
 
 def _actor_layout(policy: Any) -> Layout:

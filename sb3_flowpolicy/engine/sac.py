@@ -9,12 +9,14 @@ import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
+from sb3_flowpolicy.engine.update import Objective
+
 # SB3 halves the squared error, spinningup (and the thesis) does not.
 SB3_CRITIC_LOSS_COEF = 0.5
 
 
 @dataclass(frozen=True)
-class SACObjective:
+class SACObjective(Objective):
     r"""The :class:`~sb3_flowpolicy.engine.update.Objective` of SAC: one value per critic.
 
     .. math::

@@ -9,9 +9,11 @@ import torch as th
 from sb3_contrib.tqc.policies import Critic
 from torch import nn
 
+from sb3_flowpolicy.engine.update import Objective
+
 
 @dataclass(frozen=True)
-class TQCObjective:
+class TQCObjective(Objective):
     r"""The :class:`~sb3_flowpolicy.engine.update.Objective` of TQC: N quantiles per critic.
 
     V' are the smallest quantiles of all C critics together, V the mean of all, and the loss is

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -31,7 +31,7 @@ class TrainState(NamedTuple):
 
     actor: th.Tensor
     critic: th.Tensor
-    target: th.Tensor
+    others: tuple[th.Tensor, ...]  # the target networks, see StackedNetworks
     ent_coef: th.Tensor  # (S, 1): its logarithm if it is learned
     actor_moments: Moments
     critic_moments: Moments
@@ -42,7 +42,7 @@ class TrainState(NamedTuple):
         return TrainState(
             self.actor[seeds],
             self.critic[seeds],
-            self.target[seeds],
+            tuple(tensor[seeds] for tensor in self.others),
             self.ent_coef[seeds],
             self.actor_moments.of(seeds),
             self.critic_moments.of(seeds),
@@ -78,28 +78,56 @@ LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 """What SB3 logs of an update: the rows of the tensor (4, S) that an update returns."""
 
 
-class Objective(Protocol):
+class Objective:
     """What an algorithm makes of the critics' outputs, (S, C, B, Q): Q numbers per row and critic.
 
     Objectives are compared by value, as their constants are compiled into the update.
     """
 
-    @property
-    def name(self) -> str:
-        """The algorithm's name, for messages."""
-
-    @property
-    def critic_type(self) -> type[nn.Module]:
-        """The critics that it understands."""
+    name: ClassVar[str]
+    """The algorithm's name, for messages."""
+    critic_type: ClassVar[type[nn.Module]]
+    """The critics that it understands."""
+    layer_types: ClassVar[tuple[type[nn.Module], ...]] = (nn.Linear,)
+    """Their layers that have parameters."""
+    networks_type: ClassVar[type[StackedNetworks]] = StackedNetworks
+    """How they are evaluated."""
 
     def next_values(self, outputs: th.Tensor) -> th.Tensor:
         """Return what target critics say about the next observations, (S, B, T)."""
+        raise NotImplementedError
 
     def critic_loss(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """Return the loss (S,) of critics whose outputs are compared with targets (S, B, T)."""
+        raise NotImplementedError
 
     def actor_values(self, outputs: th.Tensor) -> th.Tensor:
         """Return the values (S, B) that the actor maximizes."""
+        raise NotImplementedError
+
+    def why_unsupported(self, policy: Any) -> str | None:
+        """Return what about a policy is not supported, besides what no algorithm supports."""
+        return None
+
+    def is_due(self, model: Any, index: int, start: int) -> bool:
+        """Return the flag of an update, here: whether to move the target networks.
+
+        Args:
+            model: The model, before the updates that are under way.
+            index: Number of updates among these that come before this one.
+            start: Number of updates before these in the same call of ``train()``.
+        """
+        return (start + index) % model.target_update_interval == 0
+
+    def mean_losses(
+        self, history: Sequence[th.Tensor], n_due: int
+    ) -> tuple[th.Tensor, tuple[str, ...]]:
+        """Return means (4, S) of the losses of several updates, and the names of those to log."""
+        return history[0] if len(history) == 1 else th.stack(list(history)).mean(0), LOSSES
+
+    def make_update(self, networks: Any, settings: UpdateSettings) -> Update:
+        """Return the function that performs one update, see :func:`make_update`."""
+        return make_update(networks, settings)
 
 
 @dataclass(frozen=True)
@@ -114,8 +142,36 @@ class UpdateSettings:
     ent_coef_adam: AdamSettings | None  # None: the entropy coefficient is fixed
 
 
-# (state, batch, learning rates, whether to move the target networks) -> losses, (4, S)
+# (state, batch, learning rates, flag of Objective.is_due) -> losses, (4, S)
 Update = Callable[[TrainState, Batch, th.Tensor, bool], th.Tensor]
+
+
+def entropy_coefficient(state: TrainState, settings: UpdateSettings) -> th.Tensor:
+    """Return the entropy coefficient, (S, 1)."""
+    return state.ent_coef if settings.ent_coef_adam is None else state.ent_coef.exp()
+
+
+def step_entropy_coefficient(
+    state: TrainState, log_prob: th.Tensor, learning_rate: th.Tensor, settings: UpdateSettings
+) -> th.Tensor:
+    """Update the entropy coefficient in place, if it is learned, and return its loss, (S, 1)."""
+    moments = state.ent_coef_moments
+    if settings.ent_coef_adam is None or moments is None:
+        return th.zeros_like(state.ent_coef)
+    # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
+    surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
+    loss = -(state.ent_coef * surplus)
+    stepped = adam_step(state.ent_coef, -surplus, *moments, learning_rate, settings.ent_coef_adam)
+    for old, new in zip((state.ent_coef, *moments), stepped, strict=True):
+        old.copy_(new)
+    return loss
+
+
+def bellman_targets(batch: Batch, next_values: th.Tensor, entropy: th.Tensor) -> th.Tensor:
+    """Return r + gamma (1 - d) (V' - entropy), (S, B, T), for values (S, B, T)."""
+    discounts = (1 - batch.dones) * batch.discounts
+    next_values = next_values - entropy.unsqueeze(-1)
+    return batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
 
 
 def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
@@ -145,35 +201,22 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
     def update(
         state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
     ) -> th.Tensor:
+        (target,) = state.others
         actor = state.actor.detach().requires_grad_()
         actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
 
         # As in SB3, this update uses the coefficient before its own step.
-        if settings.ent_coef_adam is None:
-            ent_coef = state.ent_coef
-            ent_coef_loss = th.zeros_like(ent_coef)
-        else:
-            ent_coef = state.ent_coef.exp()
-            # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
-            surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
-            ent_coef_loss = -(state.ent_coef * surplus)
-            assert state.ent_coef_moments is not None
-            moments = state.ent_coef_moments
-            stepped = adam_step(
-                state.ent_coef, -surplus, *moments, learning_rates[2], settings.ent_coef_adam
-            )
-            for old, new in zip((state.ent_coef, *moments), stepped, strict=True):
-                old.copy_(new)
+        ent_coef = entropy_coefficient(state, settings)
+        ent_coef_loss = step_entropy_coefficient(state, log_prob, learning_rates[2], settings)
 
         with th.no_grad():
             next_actions, next_log_prob = networks.sample(
                 state.actor, batch.next_obs, batch.noise[1]
             )
-            outputs = networks.q_values(state.target, batch.next_obs, next_actions)
-            entropy = ent_coef * next_log_prob
-            next_values = objective.next_values(outputs) - entropy.unsqueeze(-1)
-            discounts = (1 - batch.dones) * batch.discounts
-            targets = batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
+            outputs = networks.q_values(target, batch.next_obs, next_actions)
+            targets = bellman_targets(
+                batch, objective.next_values(outputs), ent_coef * next_log_prob
+            )
 
         critic = state.critic.detach().requires_grad_()
         outputs = networks.q_values(critic, batch.obs, batch.actions)
@@ -192,7 +235,7 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         )
 
         if move_target:
-            state.target.lerp_(new_critic, settings.tau)
+            target.lerp_(new_critic, settings.tau)
         state.critic.copy_(new_critic)
         state.actor.copy_(new_actor)
         for olds, news in (

@@ -64,7 +64,8 @@ class SeedBatch:
         env: Registered id, or a function that makes an environment. The environment's own
             vectorized form is used if it has one.
         seeds: The seeds, or their number, which stands for 0, 1, ...
-        algorithm: Class of the agents, :class:`SACFlow` or :class:`TQCFlow`.
+        algorithm: Class of the agents, :class:`SACFlow`, :class:`TQCFlow`, or
+            :class:`CrossQFlow`.
         monitor_dir: Folder for one ``monitor.csv`` per seed, as SB3's ``Monitor`` writes them.
         info_keywords: Numbers to record for each episode, besides return and length, from the info
             of its last step, as in SB3's ``Monitor``.
@@ -110,6 +111,7 @@ class SeedBatch:
         self._runtime = EngineRuntime(self._models, why_unsupported, build_engine, refuse)
         self._checkpoints = RunCheckpoints(self._describe_run)
         self._losses: list[list[float]] | None = None
+        self._logged: Sequence[str] = LOSSES
         self._experience = SeedExperience(self._models, self.seeds, env)
         self._episodes = SeedEpisodes(
             self._models, self.seeds, self._record_losses, monitor_dir, info_keywords
@@ -297,7 +299,7 @@ class SeedBatch:
                     update_learning_rate(optimizer, rate)
         self._guard.before_updates()
         batches = self._experience.minibatches(first.gradient_steps)
-        self._losses = engine.train(batches).tolist()
+        self._losses, self._logged = engine.train(batches).tolist(), engine.logged
         for model in self._models:
             model._n_updates += first.gradient_steps
         self._guard.after_updates(LOSSES, self._losses, engine.history, batches)
@@ -308,7 +310,7 @@ class SeedBatch:
         if self._losses is not None:
             rate = model.actor.optimizer.param_groups[0]["lr"]
             model.logger.record("train/learning_rate", rate)
-            model.record_losses(self._losses, index)
+            model.record_losses(self._losses, index, self._logged)
 
     def _describe_run(self) -> Run:
         """Describe what a checkpoint of this batch consists of."""
@@ -353,6 +355,6 @@ class SeedBatch:
 def _shared_settings(model: EngineFlow) -> tuple[object, ...]:
     return (
         settings_key(model),
-        *(getattr(model, name) for name in _COMMON),
+        *(getattr(model, name, None) for name in _COMMON),
         *(model.lr_schedule(left) for left in _SCHEDULE_AT),
     )

@@ -10,13 +10,13 @@ import torch as th
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.benchmarks import environments, flows, her, learning, tqc, trust, updates
+from sb3_flowpolicy.benchmarks import contrib, environments, flows, her, learning, trust, updates
 from sb3_flowpolicy.benchmarks.learning import stock_block, zoo_block
 from sb3_flowpolicy.benchmarks.throughput import GROUPS, main
 from sb3_flowpolicy.benchmarks.updates import products_alone
 from sb3_flowpolicy.engine import Engine
 
-MODULES = (updates, tqc, learning, her, environments, trust, flows)
+MODULES = (updates, contrib, learning, her, environments, trust, flows)
 
 
 def test_quick_run_writes_the_documented_json(

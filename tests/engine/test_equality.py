@@ -9,20 +9,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_flowpolicy import SACFlow, TQCFlow
+from sb3_flowpolicy import CrossQFlow, SACFlow, TQCFlow
 from sb3_flowpolicy.engine import Engine, groups
+from sb3_flowpolicy.engine.update import Batch
 
 N_UPDATES = 20
 BATCH_SIZE = 32
 # Densities that have no policy class of their own: in place of one, their name.
 WITHOUT_POLICY = ["lattice", "spline"]
-OURS: dict[Any, Any] = {SAC: SACFlow, TQC: TQCFlow}
+OURS: dict[Any, Any] = {SAC: SACFlow, TQC: TQCFlow, CrossQ: CrossQFlow}
 
 
 class DoubleExtractor(FlattenExtractor):
@@ -210,8 +212,54 @@ def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th
     check_stacked(SACFlow, policy, ent_coef, dtype)
 
 
-def test_stacked_update_of_tqc_equals_single_ones() -> None:
-    check_stacked(TQCFlow, "LowRankPolicy", "auto", th.float32, n_seeds=2)
+def crossq_loop(model: CrossQ, batches: list[Batch]) -> None:
+    """Run sb3-contrib's loop on our minibatches and noise."""
+    samples, noise = [], []
+    for k, batch in enumerate(batches, 1):
+        flat = [column[0].reshape(BATCH_SIZE, -1) for column in batch[:-1]]
+        samples.append(ReplayBufferSamples(*flat))
+        # Next actions come first; the actor is not updated every time.
+        noise += [batch.noise[1, 0]] + ([batch.noise[0, 0]] if k % model.policy_delay == 0 else [])
+    remaining, drawn = iter(samples), iter(noise)
+    model.replay_buffer.sample = lambda *_, **__: next(remaining)  # type: ignore[union-attr, method-assign]
+    model.actor.draw_noise = lambda context: next(drawn)  # type: ignore[assignment]
+    model.train(len(batches), BATCH_SIZE)
+
+
+@pytest.mark.parametrize("compile", [False, True], ids=["eager", "compiled"])
+@pytest.mark.parametrize(
+    ("policy", "ent_coef", "dtype"),
+    [("GaussPolicy", "auto", th.float32), ("FlowPolicy", 0.1, th.float64)],
+)
+def test_crossq_equals_sb3_contribs(
+    policy: str, ent_coef: Any, dtype: th.dtype, compile: bool
+) -> None:
+    """The renormalization begins within these updates.
+
+    Not with ReLU: where a unit is active for a whole minibatch, normalization cancels its bias. The
+    gradient is then nothing but rounding, which Adam scales up to whole steps.
+    """
+    policy_kwargs: dict[str, Any] = {"net_arch": [16], "activation_fn": th.nn.Tanh}
+    policy_kwargs["renorm_warmup_steps"] = 8
+    if policy == "FlowPolicy":
+        policy_kwargs["distribution_kwargs"] = {"layers": 2, "hidden": [10]}
+    settings = {"ent_coef": ent_coef, "policy_kwargs": policy_kwargs, "policy_delay": 3}
+    stock = make(CrossQ, policy, dtype, **settings)
+    ours = make(CrossQFlow, policy, dtype, compile=compile, **settings)
+    ours.policy.load_state_dict(stock.policy.state_dict())
+    with ours._runtime.running():
+        engine = ours._runtime.engine()
+        batches = engine.draw(N_UPDATES, BATCH_SIZE)
+        engine.draw = lambda *_: batches
+        ours.train(N_UPDATES, BATCH_SIZE)
+        assert engine._runs_compiled() == compile
+    crossq_loop(stock, batches)
+    assert_same(ours, stock, dtype)
+
+
+@pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
+def test_stacked_updates_of_others_equal_single_ones(algorithm: Any) -> None:
+    check_stacked(algorithm, "LowRankPolicy", "auto", th.float64, n_seeds=2)
 
 
 def check_stacked(

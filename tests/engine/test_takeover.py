@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
-from sb3_flowpolicy import SACFlow, TQCFlow
+from sb3_flowpolicy import CrossQFlow, SACFlow, TQCFlow
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.engine import Engine
 from tests.engine.test_equality import (
@@ -189,6 +189,42 @@ def test_other_numbers_of_quantiles_are_noticed() -> None:
     assert losses[0] != losses[1]
 
 
+def test_a_compiled_policy_follows_the_running_statistics() -> None:
+    model = make(CrossQFlow, "GaussPolicy", th.float32, policy_kwargs={"net_arch": [8]})
+    engine, obs, noise = Engine([model], compiled=True), th.randn(1, 4, 3), th.randn(1, 4, 2)
+    model.policy.set_training_mode(False)
+    seen = []
+    for _ in range(3):
+        with th.no_grad():
+            seen.append(engine.act(obs, noise)[0])
+            th.testing.assert_close(seen[-1], model.actor(obs[0], noise=noise[0]))
+            for name, buffer in model.actor.named_buffers():
+                if name.endswith("ra_mean"):
+                    buffer.add_(0.5)
+        if len(seen) == 2:  # as between two calls of learn()
+            engine.release()
+            engine.synchronize()
+    assert engine._runs_compiled()
+    assert not th.equal(seen[0], seen[1])
+    assert not th.equal(seen[1], seen[2])
+
+
+def test_losses_of_the_actor_are_logged_when_it_is_updated() -> None:
+    model = make(CrossQFlow, "GaussPolicy", th.float32, compile=False, policy_delay=3)
+    logged = model.logger.name_to_value
+    model.train(2, batch_size=BATCH_SIZE)
+    assert "train/critic_loss" in logged
+    assert "train/actor_loss" not in logged
+    model.train(4, batch_size=BATCH_SIZE)
+    assert {"train/actor_loss", "train/ent_coef_loss"} <= set(logged)
+
+
+def test_crossq_without_normalization_is_left_to_sb3_contrib() -> None:
+    model = make(CrossQFlow, "FlowPolicy", th.float32, policy_kwargs={"batch_norm": False})
+    with pytest.warns(UserWarning, match="not do CrossQ without batch renormalization"):
+        model.train(1, batch_size=BATCH_SIZE)
+
+
 def test_released_models_own_their_memory() -> None:
     models = [make(SACFlow, "FlowPolicy", th.float32, seed=seed) for seed in range(2)]
     engine = Engine(models)
@@ -292,6 +328,7 @@ class ActInCallback(BaseCallback):
         (SACFlow, "LowRankPolicy"),
         (SACFlow, "FlowPolicy"),
         (TQCFlow, "FlowPolicy"),
+        (CrossQFlow, "FlowPolicy"),
     ],
 )
 @pytest.mark.parametrize("mode", ["base", "log_prob"])

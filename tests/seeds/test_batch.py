@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.noise import NormalActionNoise
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy import SACFlow, SeedBatch, TQCFlow
+from sb3_flowpolicy import CrossQFlow, SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
 
 FAST: dict[str, Any] = {
@@ -58,7 +58,7 @@ def test_seeds_reproduce_and_differ() -> None:
     assert not np.array_equal(once[0], once[1])
 
 
-@pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow])
+@pytest.mark.parametrize("algorithm", [SACFlow, TQCFlow, CrossQFlow])
 def test_models_are_ordinary_models(algorithm: Any, tmp_path: Path) -> None:
     batch = SeedBatch("FlowPolicy", ENV, [3, 4], algorithm=algorithm, **FAST).learn(70)
     obs = np.zeros((5, 2), dtype=np.float32)
