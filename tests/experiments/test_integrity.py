@@ -77,8 +77,8 @@ def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -
     ("facts", "message"),
     [
         ({"key": "narrow-gauss"}, "must be of narrow-flow, got 'narrow-gauss'"),
-        ({"seeds": [9, 1]}, r"must be of 60000 steps of seeds \[1, 2\], got 60000 of \[9, 1\]"),
-        ({"steps": 5000}, r"must be of 60000 steps of seeds \[1, 2\], got 5000 of \[1, 2\]"),
+        ({"seeds": [9, 1]}, r"must be of 120000 steps of seeds \[1, 2\], got 120000 of \[9, 1\]"),
+        ({"steps": 5000}, r"must be of 120000 steps of seeds \[1, 2\], got 5000 of \[1, 2\]"),
     ],
 )
 def test_facts_of_something_else_are_noticed(
