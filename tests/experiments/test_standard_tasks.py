@@ -56,7 +56,8 @@ def test_runs_are_recorded_and_not_repeated(
 def test_mistakes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = str(tmp_path / "table.csv")
     for options, message in (
-        (["--csv", path], "--csv must name files with results"),
+        (["--csv", path], "--csv must name files with results, got .*table.csv"),
+        (["--csv", path, "--seeds", "-1"], "value must be an integer of at least 0"),
         (["--csv", path, "--task", "tunnel-2", "--algorithms", "tqc"], "no settings of tqc"),
         (["--csv", path, "--task", "tunnel-2", "--policies", "bent"], "stock, gauss, .* got bent"),
     ):
@@ -85,12 +86,29 @@ def test_settings_are_those_of_rl_zoo3_without_gsde(name: str, algorithm: str) -
 
 def test_the_rule_tells_worse_from_not_worse() -> None:
     stock = np.array([100.0, 101.0, 99.0, 100.0])
-    for scale, expected in ((0.9, "worse"), (1.0, "surely not worse"), (1.1, "better")):
-        assert rule.verdict(rule.difference(scale * stock, stock)) == expected
+    for factor, expected in ((0.9, "worse"), (1.0, "not worse"), (1.1, "better")):
+        assert rule.verdict(rule.difference(factor * stock, stock, 100.0)) == expected
     wide = np.array([60.0, 130.0, 80.0, 120.0])
-    assert rule.verdict(rule.difference(wide, stock)) == "not worse"
+    assert rule.verdict(rule.difference(wide, stock, 100.0)) == "undecided"
     # Of negative returns the less negative ones are better.
-    assert rule.verdict(rule.difference(-1.1 * stock, -stock)) == "worse"
+    assert rule.verdict(rule.difference(-1.1 * stock, -stock, 100.0)) == "worse"
+
+
+def test_few_seeds_are_no_verdict_and_successes_are_not_relative() -> None:
+    names = ["task", "algorithm", "policy", "seed", "step", "test_return", "test_success"]
+
+    def table(seeds: int, success: float) -> pd.DataFrame:
+        rows = [
+            ("a", "ppo", name, seed, 1, 100.0 * factor + seed, success * factor)
+            for name, factor in (("stock", 1.0), ("flow", 2.0))
+            for seed in range(seeds)
+        ]
+        return pd.DataFrame(rows, columns=names)
+
+    assert "| undecided |" in rule.summary(table(4, np.nan))
+    assert "| +98% (" in rule.summary(table(5, np.nan))
+    assert "| better |" in rule.summary(table(5, np.nan))
+    assert "| +10% (" in rule.summary(table(5, 0.1))
 
 
 def test_final_values_are_successes_where_there_is_a_goal() -> None:

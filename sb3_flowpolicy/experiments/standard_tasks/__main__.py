@@ -8,7 +8,7 @@ from pathlib import Path
 
 _DESCRIPTION = """\
 Train SAC, TQC, CrossQ, or PPO with its own policy and with ours on a standard task, with the same
-settings: those that rl_zoo3 publishes, without gSDE. Every test is written to a CSV file. Runs that
+settings: those that rl_zoo3 publishes, without gSDE and for fewer steps. Every test is written to a CSV file. Runs that
 are in the file are not repeated, so an interrupted command continues. Give each of several
 processes a file of its own, and all files to the last command."""
 COLUMNS = [
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     import torch as th
     from tqdm import tqdm
 
-    from sb3_flowpolicy.common.command_line import check_folder_of
+    from sb3_flowpolicy.common.command_line import at_least, check_folder_of
     from sb3_flowpolicy.common.files import replacing
     from sb3_flowpolicy.experiments.standard_tasks import rule, training
     from sb3_flowpolicy.experiments.standard_tasks.tasks import CANDIDATES, TASKS
@@ -46,15 +46,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--task", choices=list(TASKS), help="task to train on (default: none, only the table)")
     add("--algorithms", choices=list(CANDIDATES), nargs="+", help="default: all of the task's")
     add("--policies", nargs="+", help="default: all of the algorithm's, stock among them")
-    add("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], help="default: 1 2 3 4 5")
-    add("--episodes", type=int, default=5, help="episodes per test (default: 5)")
+    add("--seeds", type=at_least(0), nargs="+", default=[1, 2, 3, 4, 5], help="default: 1 2 3 4 5")
+    add("--episodes", type=at_least(1), default=5, help="episodes per test (default: 5)")
     add("--csv", type=Path, nargs="+", required=True, help="results; new runs go to the first")
     add("--figure", type=Path, metavar="FILE", help="also draw the curves")
     args = parser.parse_args(arguments)
     for option, path in (("--csv", args.csv[0]), ("--figure", args.figure)):
         check_folder_of(parser, option, path)
     th.set_num_threads(1)
+    for path in args.csv[0 if args.task is None else 1 :]:
+        if not path.exists():
+            parser.error(f"--csv must name files with results, got {path}")
     tables = [pd.read_csv(path) for path in args.csv if path.exists()]
+    for path, one in zip([path for path in args.csv if path.exists()], tables, strict=True):
+        if list(one) != COLUMNS:
+            parser.error(f"--csv must name files with the columns {COLUMNS}, got {path}")
     mine = tables[:1] if args.csv[0].exists() else []
     done = {
         run for table in tables for run in table[COLUMNS[:4]].itertuples(index=False, name=None)
@@ -79,8 +85,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         mine.append(tables[-1])
         with replacing(args.csv[0]) as draft:
             pd.concat(mine).to_csv(draft, index=False)
-    if not tables:
-        parser.error("--csv must name files with results, or --task a task to train on")
     table = pd.concat(tables)
     print(rule.summary(table))
     if args.figure is not None:

@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import ttest_ind
 
-from sb3_flowpolicy.common.statistics import BOOTSTRAP_SEED, RESAMPLES, Estimate
+from sb3_flowpolicy.common.statistics import Estimate
 
 RULE = """\
-The final value of a run is the mean return of its last two tests, or the share of successes if
-the task has a goal. A policy is "not worse than stock" if
-the 95 % bootstrap interval of the difference of mean final values, as a share of stock's, reaches
-above -5 %, and "better" if it lies above 0. With "surely" the whole interval lies above -5 %."""
-_TOLERANCE = -0.05
+The final value of a run is the mean return of its last two tests, or the share of successes where
+the task has a goal. Differences from stock have a 95 % interval (Welch's) and are relative to
+stock's mean return, or absolute for successes. "better": the interval lies above 0. "not worse": it
+lies above -5 %. "worse": it lies below -5 %. Otherwise, and with fewer than five seeds:
+"undecided". "Never worse than stock" fails where the verdict is "worse"."""
+_TOLERANCE, _FEWEST_SEEDS = -0.05, 5
 
 
 def finals(table: pd.DataFrame) -> pd.Series:
@@ -26,42 +28,35 @@ def finals(table: pd.DataFrame) -> pd.Series:
     return runs["score"].apply(lambda tests: tests.tail(2).mean())
 
 
-def difference(ours: np.ndarray, stock: np.ndarray) -> Estimate:
-    """Return the difference of the means as a share of stock's, with its 95 % interval.
-
-    If stock's mean is 0, the difference itself.
+def difference(ours: np.ndarray, stock: np.ndarray, scale: float = 1.0) -> Estimate:
+    """Return the difference of the means as a share of ``scale``, with its 95 % interval.
 
     Args:
-        ours: One final return per seed, (S,).
+        ours: One final value per seed, (S,), at least two.
         stock: The same of the stock policy, (S',).
+        scale: Above 0.
 
     Example:
-        >>> print(f"{difference(np.array([110.0, 112.0]), np.array([100.0, 100.0])):+.2f}")
-        +0.11 (+0.10, +0.12)
+        >>> print(f"{difference(np.array([110.0, 112.0]), np.array([99.0, 101.0]), 100.0):+.2f}")
+        +0.11 (+0.05, +0.17)
     """
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    scale = abs(stock.mean()) or 1.0
-
-    def means(values: np.ndarray) -> np.ndarray:
-        return values[rng.integers(len(values), size=(RESAMPLES, len(values)))].mean(1)
-
-    shares = (means(ours) - means(stock)) / scale
-    low, high = np.quantile(shares, [0.025, 0.975])
-    return Estimate((ours.mean() - stock.mean()) / scale, low, high)
+    interval = ttest_ind(ours, stock, equal_var=False).confidence_interval(0.95)
+    mean, low, high = (ours.mean() - stock.mean(), interval.low, interval.high)
+    return Estimate(mean / scale, low / scale, high / scale)
 
 
 def verdict(found: Estimate) -> str:
-    """Return what ``RULE`` says.
+    """Return what ``RULE`` says of enough seeds.
 
     Example:
         >>> verdict(Estimate(0.0, -0.2, 0.2)), verdict(Estimate(0.1, 0.02, 0.2))
-        ('not worse', 'better')
+        ('undecided', 'better')
     """
     if found.low > 0:
         return "better"
     if found.low > _TOLERANCE:
-        return "surely not worse"
-    return "not worse" if found.high > _TOLERANCE else "worse"
+        return "not worse"
+    return "worse" if found.high < _TOLERANCE else "undecided"
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -70,14 +65,18 @@ def summary(table: pd.DataFrame) -> str:
         "| task | algorithm | policy | final value | against stock | verdict | seeds |",
         "|---|---|---|---|---|---|---|",
     ]
+    has_goal = table.groupby(["task", "algorithm"])["test_success"].count() > 0
     for (task, algorithm), group in finals(table).groupby(level=[0, 1], sort=False):
         runs = {name: returns.to_numpy() for name, returns in group.groupby(level=2, sort=False)}
         for name, returns in runs.items():
             against = judged = ""
-            if name != "stock" and "stock" in runs:
-                found = difference(returns, runs["stock"])
+            stock = runs.get("stock")
+            if name != "stock" and stock is not None and min(len(returns), len(stock)) > 1:
+                scale = 1.0 if has_goal[task, algorithm] else abs(stock.mean())
+                found = difference(returns, stock, scale)
                 against = f"{found.value:+.0%} ({found.low:+.0%}, {found.high:+.0%})"
-                judged = verdict(found)
+                enough = min(len(returns), len(stock)) >= _FEWEST_SEEDS
+                judged = verdict(found) if enough else "undecided"
             each = ", ".join(f"{value:.3g}" for value in returns)
             cells = (task, algorithm, name, f"{returns.mean():.3g}", against, judged, each)
             lines.append(f"| {' | '.join(cells)} |")
@@ -95,9 +94,14 @@ def save_figure(table: pd.DataFrame, path: Path) -> None:
     ):
         for k, (name, runs) in enumerate(group.groupby("policy", sort=False)):
             shade = "black" if name == "stock" else f"C{k}"
-            curves = runs.pivot_table(index="step", columns="seed", values="test_return")
+            scores = runs.assign(score=runs["test_success"].fillna(runs["test_return"]))
+            curves = scores.pivot_table(index="step", columns="seed", values="score")
             axes.plot(curves.index, curves, color=shade, linewidth=0.6, alpha=0.5)
             axes.plot(curves.index, curves.mean(axis=1), color=shade, linewidth=2, label=name)
-        axes.set(title=f"{algorithm} on {task}", xlabel="environment steps", ylabel="return")
+        axes.set(
+            title=f"{algorithm} on {task}",
+            xlabel="environment steps",
+            ylabel="return, or share of successes",
+        )
         axes.legend()
     figure.savefig(path, dpi=110)

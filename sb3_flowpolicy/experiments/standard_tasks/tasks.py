@@ -107,7 +107,7 @@ TASKS: dict[str, Task] = {
     "half-cheetah": Task("HalfCheetahBulletEnv-v0", _STEPS, _CHEETAH, {}),
     "hopper": Task("HopperBulletEnv-v0", _STEPS, _HOPPER, {}),
     "walker": Task("Walker2DBulletEnv-v0", _STEPS, _WALKER, {}),
-    # Of ours: small networks and short runs, for a quick look.
+    # Our own settings with small networks, for a quick look.
     "half-cheetah-quick": Task(
         "HalfCheetahBulletEnv-v0",
         {"ppo": 150_000},
