@@ -40,9 +40,11 @@ def difference(ours: np.ndarray, stock: np.ndarray, scale: float = 1.0) -> Estim
         >>> print(f"{difference(np.array([110.0, 112.0]), np.array([99.0, 101.0]), 100.0):+.2f}")
         +0.11 (+0.05, +0.17)
     """
+    mean = (ours.mean() - stock.mean()) / scale
+    if np.ptp(ours) == np.ptp(stock) == 0.0:  # all seeds solve the task, or none does
+        return Estimate(mean, mean, mean)
     interval = ttest_ind(ours, stock, equal_var=False).confidence_interval(0.95)
-    mean, low, high = (ours.mean() - stock.mean(), interval.low, interval.high)
-    return Estimate(mean / scale, low / scale, high / scale)
+    return Estimate(mean, interval.low / scale, interval.high / scale)
 
 
 def verdict(found: Estimate) -> str:
