@@ -8,8 +8,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
 
-# Compiling repays itself after 1500 to 5000 updates, whatever the width and the number of seeds:
-# both its time and what it saves per update grow with them (docs/engine.md).
+# Compiling pays after 1800 to 5000 updates, depending on width, density, and the number of seeds
+# (docs/engine.md).
 UPDATES_WORTH_COMPILING = 5000
 
 

@@ -156,11 +156,10 @@ def _best(
     candidates = []
     for common in commons:
         scale = _widest(common * shared, own, width, survival)
-        if scale > 0.0:
-            actions = np.tanh(common * shared + scale * own)
-            progress = float(actions.mean(axis=1).std())
-            entropy = _entropy(dims, scale, common)
-            candidates.append(Prediction(entropy, progress, scale, float(common)))
+        actions = np.tanh(common * shared + scale * own)
+        progress = float(actions.mean(axis=1).std())
+        entropy = _entropy(dims, scale, common)
+        candidates.append(Prediction(entropy, progress, scale, float(common)))
     return max(candidates, key=lambda one: one.entropy)
 
 
