@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_flowpolicy.engine.observations import Observations
@@ -18,6 +18,8 @@ from sb3_flowpolicy.engine.update import Batch
 
 # A column is an attribute of SB3's buffer; a row holds one transition, in this order.
 COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+# Buffers whose samples are independent rows. Not HER's: its real transitions come first.
+_INDEPENDENT = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
 
 
 def is_plain(buffer: ReplayBuffer) -> bool:
@@ -120,7 +122,9 @@ def draw_index(buffers: Sequence[ReplayBuffer], n_updates: int, batch_size: int)
 def sample_columns(
     model: Any, observations: Observations, n_updates: int, batch_size: int
 ) -> list[th.Tensor]:
-    """Let a model's buffer sample, once for all updates: n-step, HER, VecNormalize, ...
+    """Let a model's buffer sample: n-step, HER, VecNormalize, ...
+
+    Buffers with independent samples do so once for all updates, others once per update.
 
     Args:
         model: SB3's algorithm; its replay buffer is not empty.
@@ -132,20 +136,25 @@ def sample_columns(
         The fields of :class:`Batch` except the noise, each (n_updates, 1, batch_size, ...).
     """
     buffer, env = model.replay_buffer, model.get_vec_normalize_env()
+    n_calls = 1 if type(buffer) in _INDEPENDENT else n_updates
+    calls = []
     with _filled_rows_only(buffer):
-        samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size, env=env)
-    discounts = samples.discounts
-    if discounts is None:
-        discounts = th.full_like(samples.rewards, model.gamma)
-    columns = (
-        observations.pack(samples.observations),
-        samples.actions,
-        observations.pack(samples.next_observations),
-        samples.dones.squeeze(-1),
-        samples.rewards.squeeze(-1),
-        discounts.squeeze(-1),
-    )
-    return [column.unflatten(0, (n_updates, 1, batch_size)) for column in columns]
+        for _ in range(n_calls):
+            samples: ReplayBufferSamples = buffer.sample(n_updates * batch_size // n_calls, env=env)
+            discounts = samples.discounts
+            if discounts is None:
+                discounts = th.full_like(samples.rewards, model.gamma)
+            columns = (
+                observations.pack(samples.observations),
+                samples.actions,
+                observations.pack(samples.next_observations),
+                samples.dones.squeeze(-1),
+                samples.rewards.squeeze(-1),
+                discounts.squeeze(-1),
+            )
+            calls.append(columns)
+    shape = (n_updates, 1, batch_size)
+    return [th.cat(parts).unflatten(0, shape) for parts in zip(*calls, strict=True)]
 
 
 @contextmanager
