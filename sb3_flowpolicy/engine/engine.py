@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch as th
@@ -166,8 +166,8 @@ class Engine:
             if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):
                 return False
         return all(
-            home[name] is parameter and parameter.requires_grad == trains
-            for home, name, parameter, trains in self._slots
+            home[name] is tensor and (tensor.requires_grad, tensor.dtype, tensor.device) == kind
+            for home, name, tensor, kind in self._slots
         )
 
     def _parts(self) -> list[FlatParameters | FlatAdam]:
@@ -348,17 +348,29 @@ def _identity(model: Any) -> tuple[object, ...]:
     )
 
 
-def _slots(model: Any) -> list[tuple[dict[str, nn.Parameter | None], str, nn.Parameter, bool]]:
-    """Return where the first parameter of each network is, the parameter, and whether it trains.
+_Slot = tuple[Mapping[str, th.Tensor | None], str, th.Tensor, tuple[bool, th.dtype, th.device]]
 
-    Parameters are replaced or frozen all at once, by ``load_state_dict(assign=True)`` or
-    ``actor.requires_grad_(False)`` for example.
+
+def _slots(model: Any) -> list[_Slot]:
+    """Return where tensors are, the tensors, whether they train, and their type and device.
+
+    Of each network's parameters the first is enough: they are replaced, frozen, or moved all at
+    once, by ``load_state_dict(assign=True)`` or ``actor.requires_grad_(False)`` for example. Of the
+    layers' buffers, which ``policy.to(dtype)`` replaces, all are returned.
     """
-    slots = []
+    homes: list[tuple[Mapping[str, th.Tensor | None], str]] = []
+    layer_types = model.objective().layer_types
     targets = [model.critic_target] if hasattr(model, "critic_target") else []
     for network in (model.actor, model.critic, *targets):
-        path, parameter = next(network.named_parameters())
+        path, _ = next(network.named_parameters())
         module, _, name = path.rpartition(".")
-        home = network.get_submodule(module)._parameters
-        slots.append((home, name, parameter, parameter.requires_grad))
+        homes.append((network.get_submodule(module)._parameters, name))
+        for layer in network.modules():
+            if isinstance(layer, layer_types):
+                homes += [(layer._buffers, key) for key in layer._buffers]
+    slots = []
+    for home, name in homes:
+        tensor = home[name]
+        assert tensor is not None
+        slots.append((home, name, tensor, (tensor.requires_grad, tensor.dtype, tensor.device)))
     return slots

@@ -189,6 +189,28 @@ def test_other_numbers_of_quantiles_are_noticed() -> None:
     assert losses[0] != losses[1]
 
 
+def test_running_statistics_that_were_moved_are_noticed() -> None:
+    """Moving a policy replaces its buffers, while its parameters stay the same objects."""
+    calm, moved = (make(CrossQFlow, "GaussPolicy", th.float32, compile=False) for _ in range(2))
+    for model in (calm, moved):
+        with model._runtime.running():
+            for _ in range(3):
+                seed_everything()
+                model.train(3, batch_size=BATCH_SIZE)
+                if model is moved:
+                    model.policy.to(th.float64).to(th.float32)
+    assert_close(everything(moved), everything(calm), th.float32)
+
+
+def test_an_engine_of_another_data_type_is_dropped() -> None:
+    """Compiled functions do not check the types of their arguments."""
+    model = make(SACFlow, "GaussPolicy", th.float32, compile=False)
+    with model._runtime.running():
+        before = model._runtime.engine()
+        model.policy.to(th.float64)
+        assert model._runtime.engine() is not before
+
+
 def test_a_compiled_policy_follows_the_running_statistics() -> None:
     model = make(CrossQFlow, "GaussPolicy", th.float32, policy_kwargs={"net_arch": [8]})
     engine, obs, noise = Engine([model], compiled=True), th.randn(1, 4, 3), th.randn(1, 4, 2)
