@@ -51,7 +51,13 @@ class CrossQObjective(SACObjective):
         networks = (policy.actor.latent_pi, policy.critic.q_networks[0])
         if not all(any(isinstance(one, BatchRenorm1d) for one in net) for net in networks):
             return "CrossQ without batch renormalization"
+        if len({_constants(network) for network in policy.critic.q_networks}) > 1:
+            return "critics that differ in their batch renormalization"
         return None
+
+    def layer_constants(self, policy: Any) -> tuple[object, ...]:
+        """Return the constants of the batch renormalization."""
+        return tuple(map(_constants, (policy.actor.latent_pi, *policy.critic.q_networks)))
 
     def is_due(self, model: Any, index: int, start: int) -> bool:
         """Whether it is the actor's turn in this update."""
@@ -149,6 +155,14 @@ class CrossQObjective(SACObjective):
             return th.stack([loss.detach() for loss in losses])
 
         return update
+
+
+def _constants(network: nn.Module) -> tuple[tuple[float, ...], ...]:
+    return tuple(
+        (layer.eps, layer.momentum, layer.rmax, layer.dmax, layer.warmup_steps)
+        for layer in network.children()
+        if isinstance(layer, BatchRenorm1d)
+    )
 
 
 def _write(olds: dict[str, th.Tensor], news: dict[str, th.Tensor]) -> None:

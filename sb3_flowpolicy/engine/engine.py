@@ -73,7 +73,9 @@ def settings_key(model: Any) -> tuple[object, ...]:
         groups.append(model.ent_coef_optimizer.param_groups[0])
     names = ("betas", "eps", "weight_decay", "amsgrad", "maximize")
     adam = [group.get(name) for group in groups for name in names]
-    return (model.objective(), model.tau, model.target_entropy, *adam)
+    objective = model.objective()
+    constants = objective.layer_constants(model.policy)
+    return (objective, model.tau, model.target_entropy, *adam, *constants)
 
 
 def build_engine(models: Sequence[Any], compiled: bool) -> Engine:

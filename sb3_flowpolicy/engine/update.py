@@ -109,6 +109,10 @@ class Objective:
         """Return what about a policy is not supported, besides what no algorithm supports."""
         return None
 
+    def layer_constants(self, policy: Any) -> tuple[object, ...]:
+        """Return constants of a policy's layers, which are compiled into the update, too."""
+        return ()
+
     def is_due(self, model: Any, index: int, start: int) -> bool:
         """Return the flag of an update, here: whether to move the target networks.
 

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib.common.torch_layers import BatchRenorm1d
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -209,6 +210,26 @@ def test_an_engine_of_another_data_type_is_dropped() -> None:
         before = model._runtime.engine()
         model.policy.to(th.float64)
         assert model._runtime.engine() is not before
+
+
+@pytest.mark.parametrize("name", ["momentum", "eps", "warmup_steps"])
+def test_other_constants_of_the_renormalization_are_noticed(name: str) -> None:
+    """They are compiled into the update."""
+    model = make(CrossQFlow, "GaussPolicy", th.float32, compile=False)
+    with model._runtime.running():
+        before = model._runtime.engine()
+        assert model._runtime.engine() is before
+        for layer in model.policy.modules():
+            if isinstance(layer, BatchRenorm1d):
+                setattr(layer, name, 0.5)
+        assert model._runtime.engine() is not before
+
+
+def test_critics_with_unequal_renormalization_are_left_to_sb3_contrib() -> None:
+    model = make(CrossQFlow, "GaussPolicy", th.float32)
+    model.critic.q_networks[1][0].momentum = 0.5
+    with pytest.warns(UserWarning, match="critics that differ in their batch renormalization"):
+        model.train(1, batch_size=BATCH_SIZE)
 
 
 def test_a_compiled_policy_follows_the_running_statistics() -> None:
