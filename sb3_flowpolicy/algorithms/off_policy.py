@@ -327,7 +327,8 @@ class OffPolicyFlow(OffPolicyAlgorithm):
 
     def _load_run_state(self, state: dict[str, Any]) -> None:
         for name, part in self._stateful_parts().items():
-            part.load_state(state[name])
+            if name in state:  # else the checkpoint was written before there was this part
+                part.load_state(state[name])
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_guard", "_checkpoints"]
