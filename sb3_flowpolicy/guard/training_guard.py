@@ -182,17 +182,21 @@ class TrainingGuard:
 
 
 class _Snapshot:
-    """A copy of many tensors in one, which makes copying and checking fast."""
+    """A copy of many tensors, the floats in one, which makes copying and checking fast."""
 
     def __init__(self, tensors: Mapping[str, th.Tensor]) -> None:
-        self.sizes = {name: tensor.numel() for name, tensor in tensors.items()}
-        device = next(iter(tensors.values())).device
+        floats = {name: value for name, value in tensors.items() if value.is_floating_point()}
+        self.sizes = {name: tensor.numel() for name, tensor in floats.items()}
+        device = next(iter(floats.values())).device
         # torch.optim keeps its counts of steps on the CPU.
-        self.flat = th.cat([tensor.flatten().to(device) for tensor in tensors.values()])
+        self.flat = th.cat([tensor.flatten().to(device) for tensor in floats.values()])
+        # Counts, for example of the steps of a batch renormalization.
+        self._others = {name: tensors[name].clone() for name in tensors if name not in floats}
 
     def tensors(self) -> dict[str, th.Tensor]:
-        """Return the copies by name, flat."""
-        return dict(zip(self.sizes, self.flat.split(list(self.sizes.values())), strict=True))
+        """Return the copies by name; floats are flat."""
+        parts = self.flat.split(list(self.sizes.values()))
+        return {**dict(zip(self.sizes, parts, strict=True)), **self._others}
 
     def find_non_finite(self) -> str | None:
         """Return the name of a tensor that is not finite, None if all are."""
@@ -213,11 +217,7 @@ def _training_tensors(model: Any) -> dict[str, th.Tensor]:
         for number, parameter in enumerate(parameters):
             for key, state in optimizer.state.get(parameter, {}).items():
                 states[f"{owner}.optimizer.{number}.{key}"] = state
-    return {
-        name: state
-        for name, state in states.items()
-        if isinstance(state, th.Tensor) and state.is_floating_point()
-    }
+    return {name: state for name, state in states.items() if isinstance(state, th.Tensor)}
 
 
 def _summary(values: np.ndarray) -> dict[str, float]:

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_flowpolicy import NonFiniteError, SACFlow, SeedBatch
+from sb3_flowpolicy import CrossQFlow, NonFiniteError, SACFlow, SeedBatch
 from sb3_flowpolicy.guard.finite import all_finite
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 
@@ -218,6 +218,20 @@ def test_training_stops_and_goes_back(
     model.train(3, batch_size=16)
     assert model._n_updates == updates + 3
     model.predict(np.zeros(3, np.float32))
+
+
+def test_crossq_goes_back_with_its_running_statistics() -> None:
+    """Their counts of steps are integers."""
+    model = CrossQFlow("GaussPolicy", "Pendulum-v1", compile=False, **SEEDED).learn(60)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    assert before["critic.qf0.0.steps"] > 0
+    model._guard.restart()
+    model.train(3, batch_size=16)
+    assert model.replay_buffer is not None
+    model.replay_buffer.rewards[:] = np.nan
+    with pytest.raises(NonFiniteError, match=r"critic_loss must be finite"):
+        model.train(3, batch_size=16)
+    th.testing.assert_close(dict(model.policy.state_dict()), before, rtol=0, atol=0)
 
 
 def test_the_update_and_the_row_are_named() -> None:
