@@ -54,6 +54,8 @@ def check_stackable(model: EngineFlow) -> None:
     reason, frequency, buffer = why_unsupported(model), model.train_freq, model.replay_buffer
     assert isinstance(frequency, TrainFreq)
     assert buffer is not None
+    if isinstance(model.observation_space, gym.spaces.Dict):
+        refuse("dictionary observations, which are not supported")
     if reason is not None:
         refuse(reason)
     if is_image_space(model.observation_space):
@@ -65,7 +67,8 @@ def check_stackable(model: EngineFlow) -> None:
     if model.device.type != "cpu":
         refuse(f"device {model.device}")
     if not is_plain(buffer):
-        refuse(f"{type(buffer).__name__}, {buffer.optimize_memory_usage=}")
+        optimized = " with optimize_memory_usage=True" if buffer.optimize_memory_usage else ""
+        refuse(f"{type(buffer).__name__}{optimized}")
 
 
 def refuse(reason: str) -> None:

@@ -17,6 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
+from sb3_flowpolicy.benchmarks.her import make_reach
 
 FAST: dict[str, Any] = {
     "learning_starts": 30,
@@ -285,6 +286,11 @@ def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
         settings["replay_buffer_kwargs"] = {"handle_timeout_termination": False}
     with pytest.raises(ValueError, match=message):
         SeedBatch("FlowPolicy", ENV, **settings)
+
+
+def test_dictionary_observations_are_not_supported() -> None:
+    with pytest.raises(ValueError, match=r"fixed .*, got dictionary observations, which are not"):
+        SeedBatch("MultiInputFlowPolicy", make_reach, 2, **FAST)
 
 
 def test_seeds_are_integers() -> None:
