@@ -112,7 +112,7 @@ class PPOFlow(PPO):
         engine = self._runtime.engine() if acts else None
         if engine is None:
             return super().collect_rollouts(*args, **kwargs)
-        with engine.collecting():
+        with engine.collecting(self._runtime.is_watched):
             return super().collect_rollouts(*args, **kwargs)
 
     def train(self) -> None:

@@ -81,6 +81,13 @@ class PPOEngine:
         names = {f"policy.{name}": [value] for name, value in policy.named_parameters()}
         self.flat = FlatParameters([names])
         self.adam = FlatAdam(self.flat, [policy.optimizer])
+        self._kind = _kind(self.flat.data)
+        self._slots = [
+            (module._parameters, name, parameter)
+            for module in policy.modules()
+            for name, parameter in module._parameters.items()
+            if parameter is not None
+        ]
         self.settings = _settings(model)
         device = self.flat.data.device
         self._eager_update = make_ppo_update(policy, self.flat, self.settings)
@@ -93,7 +100,13 @@ class PPOEngine:
         """Whether the model still has the same policy, optimizer and constants."""
         (model,) = models
         same = model.policy is self.policy and self.policy.optimizer is self.optimizer
+        same = same and self._has_same_parameters()
         return same and why_ppo_unsupported(model) is None and self.settings == _settings(model)
+
+    def _has_same_parameters(self) -> bool:
+        """Whether the policy has the same parameters, of the same type and on the same device."""
+        same = all(home[name] is parameter for home, name, parameter in self._slots)
+        return same and _kind(self._slots[0][2]) == self._kind
 
     def synchronize(self) -> bool:
         """Take over parameters or optimizer states that were replaced since the last call."""
@@ -109,9 +122,14 @@ class PPOEngine:
         self.adam.release()
 
     @contextmanager
-    def collecting(self) -> Iterator[None]:
-        """Let the policy's ``forward`` run compiled within this context."""
-        self.policy.forward = self.act  # type: ignore[method-assign]
+    def collecting(self, watched: bool = True) -> Iterator[None]:
+        """Let the policy's ``forward`` run compiled within this context.
+
+        Args:
+            watched: Whether callbacks may change the policy meanwhile.
+        """
+        forward = self._act_watched if watched else self.act
+        self.policy.forward = forward  # type: ignore[method-assign]
         try:
             yield
         finally:
@@ -129,6 +147,15 @@ class PPOEngine:
         actions, values, log_prob = self._act(key, self.flat.data, obs, noise)
         check_finite(actions.cpu().numpy())
         return actions, values, log_prob
+
+    def _act_watched(
+        self, obs: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Act with the parameters that the policy has now."""
+        if not self._has_same_parameters():  # a new engine follows at the next rollout
+            return type(self.policy).forward(self.policy, obs, deterministic)
+        self.synchronize()
+        return self.act(obs, deterministic)
 
     def train(self, clip_range: float, clip_range_vf: float) -> dict[str, list[float]]:
         """Do the updates of one rollout.
@@ -181,3 +208,7 @@ class PPOEngine:
         if len(samples.actions) < self.model.batch_size:
             return self._eager_update(state, batch, scalars)
         return self._update(len(samples.actions), state, batch, scalars)
+
+
+def _kind(tensor: th.Tensor) -> tuple[th.dtype, th.device]:
+    return tensor.dtype, tensor.device

@@ -69,6 +69,11 @@ class EngineRuntime(Generic[BoundT]):
         return self._running
 
     @property
+    def is_watched(self) -> bool:
+        """Whether callbacks may change the models."""
+        return self._watched
+
+    @property
     def compiles(self) -> bool:
         """Whether the models' settings, and the number of planned updates, ask for compiling."""
         wanted = self.models[0].compile

@@ -112,6 +112,29 @@ def test_acting_equals_the_policys_own() -> None:
     assert "forward" not in vars(model.policy)
 
 
+@pytest.mark.parametrize("what", ["loaded", "assigned", "moved", "shifted"])
+def test_acting_follows_what_callbacks_do_to_the_policy(what: str) -> None:
+    model = collected("FlowPolicy", th.float32, {})
+    policy, obs = model.policy, th.randn(3, 42)
+    engine = PPOEngine(model, compiled=False)
+    state = {name: value + 0.1 for name, value in policy.state_dict().items()}
+    with engine.collecting():
+        if what == "moved":
+            policy.to(th.float64)
+            policy.features_extractor.dtype = th.float64
+        elif what == "shifted":
+            for name, parameter in policy.named_parameters():
+                parameter.data = state[name]
+        else:
+            policy.load_state_dict(state, assign=what == "assigned")
+        th.manual_seed(2)
+        found = policy(obs)
+    th.manual_seed(2)
+    expected = policy(obs)
+    th.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert engine.fits([model]) == (what in ("loaded", "shifted"))
+
+
 def test_a_minibatch_with_a_log_probability_that_is_not_finite_changes_nothing() -> None:
     model = collected("FlowPolicy", th.float32, {})
     model.rollout_buffer.actions[:] = np.nan
