@@ -196,9 +196,9 @@ def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
         >>> check_policy(FlowTQCPolicy, SACPolicy, ["FlowPolicy"])
         Traceback (most recent call last):
         ...
-        ValueError: policy must be one of ['FlowPolicy'] or a subclass of SACPolicy, got FlowTQCPolicy
+        ValueError: policy must be one of ['FlowPolicy'] or subclass SACPolicy, got FlowTQCPolicy
     """
     known = list(names)
     if not (issubclass(policy, base) if isinstance(policy, type) else policy in known):
         name = getattr(policy, "__name__", repr(policy))
-        raise ValueError(f"policy must be one of {known} or a subclass of {base.__name__}, got {name}")
+        raise ValueError(f"policy must be one of {known} or subclass {base.__name__}, got {name}")
