@@ -71,7 +71,9 @@ def test_it_is_guarded_and_its_arguments_are_checked() -> None:
         CautiousSACFlow("FlowPolicy", Faulty("rewards", np.nan), **FAST).learn(40)
     with pytest.raises(ValueError, match="caution must be at most 1, got 2"):
         CautiousSACFlow("FlowPolicy", ENV, caution=2, **FAST)
-    with pytest.raises(ValueError, match=r"must be one of .* or subclass SACPolicy, got 'NoPolicy'"):
+    with pytest.raises(
+        ValueError, match=r"must be one of .* or subclass SACPolicy, got 'NoPolicy'"
+    ):
         CautiousSACFlow("NoPolicy", ENV, **FAST)
 
 
