@@ -32,13 +32,16 @@ def adam_settings(optimizer: th.optim.Optimizer) -> AdamSettings | None:
     return AdamSettings(beta1, beta2, group["eps"], group["weight_decay"], decoupled)
 
 
-def why_optimizer_unsupported(optimizer: th.optim.Optimizer) -> str | None:
-    """Return what about an optimizer the engines do not support; None if they support it."""
+def why_optimizer_unsupported(optimizer: th.optim.Optimizer, network: th.nn.Module) -> str | None:
+    """Return what about a network's optimizer the engines do not support, None if nothing."""
     if adam_settings(optimizer) is None:
         return f"optimizer of type {type(optimizer).__name__} with these settings"
     if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
         return "optimizer with hooks"
-    states = [optimizer.state.get(owner, {}) for owner in optimizer.param_groups[0]["params"]]
+    owners = optimizer.param_groups[0]["params"]
+    if set(map(id, owners)) != set(map(id, network.parameters())):
+        return "optimizer of other parameters than the network's"
+    states = [optimizer.state.get(owner, {}) for owner in owners]
     if len({float(state.get("step", 0)) for state in states}) > 1:
         return "optimizer of which a part was reset"
     return None

@@ -59,8 +59,8 @@ def why_unsupported(model: Any) -> str | None:
     for parameter in (*policy.actor.parameters(), *policy.critic.parameters()):
         if not parameter.requires_grad or parameter._backward_hooks:
             return "parameters that are frozen or have hooks"
-    for optimizer in (policy.actor.optimizer, policy.critic.optimizer):
-        reason = why_optimizer_unsupported(optimizer)
+    for network in (policy.actor, policy.critic):
+        reason = why_optimizer_unsupported(network.optimizer, network)
         if reason is not None:
             return reason
     return objective.why_unsupported(policy)

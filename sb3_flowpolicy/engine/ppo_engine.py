@@ -41,7 +41,7 @@ def why_ppo_unsupported(model: PPO) -> str | None:
     for parameter in policy.parameters():
         if not parameter.requires_grad or parameter._backward_hooks:
             return "parameters that are frozen or have hooks"
-    return why_optimizer_unsupported(policy.optimizer)
+    return why_optimizer_unsupported(policy.optimizer, policy)
 
 
 def _settings(model: PPO) -> PPOSettings:

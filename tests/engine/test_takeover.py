@@ -147,6 +147,16 @@ def test_frozen_parameters_and_hooks_are_left_to_sb3() -> None:
     assert len(calls) == 2
 
 
+def test_assigned_parameters_without_an_optimizer_are_left_to_sb3() -> None:
+    model = make(SACFlow, "GaussPolicy", th.float32, compile=False)
+    model.train(2, batch_size=BATCH_SIZE)
+    state = {key: value.clone() for key, value in model.policy.state_dict().items()}
+    model.policy.load_state_dict(state, assign=True)
+    with pytest.warns(UserWarning, match="optimizer of other parameters than the network's"):
+        model.train(1, batch_size=BATCH_SIZE)
+    model.get_parameters()
+
+
 def test_an_engine_that_no_longer_fits_is_dropped() -> None:
     """Its tensors are orphans: the policy must not go on acting with them."""
     model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
