@@ -59,7 +59,7 @@ class EngineFlow(OffPolicyFlow):
         check_settings({"compile": compile, "autocast": autocast}, self.settings)
         self.compile: bool | Literal["auto"] = compile
         self.autocast = autocast
-        self._runtime = EngineRuntime([self], why_unsupported, build_engine, warn_of_sb3s_loop)
+        self._runtime = EngineRuntime([self], why_unsupported, build_engine, warn_of_stock_loop)
         super().__init__(*args, **kwargs)
 
     @abstractmethod
@@ -193,10 +193,10 @@ class EngineFlow(OffPolicyFlow):
         return [*super()._excluded_save_params(), "_runtime"]
 
 
-def warn_of_sb3s_loop(reason: str) -> None:
-    """Say that the engine does not do something."""
+def warn_of_stock_loop(reason: str) -> None:
+    """Say that the engine does not support something."""
     warnings.warn(
-        f"training runs SB3's own loop, which is slower: the engine does not do {reason}",
+        f"training runs the stock loop, which is slower: the engine does not support {reason}",
         UserWarning,
         stacklevel=5,
     )

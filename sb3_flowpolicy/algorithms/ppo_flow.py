@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_flowpolicy.algorithms.engine_flow import warn_of_sb3s_loop
+from sb3_flowpolicy.algorithms.engine_flow import warn_of_stock_loop
 from sb3_flowpolicy.common.validation import (
     Check,
     by_name,
@@ -63,7 +63,7 @@ class PPOFlow(PPO):
             faster after about 15 seconds of warm-up. ``"auto"`` compiles once calls of
             :meth:`learn` have planned enough updates to repay it. Compiled or not, the numbers are
             the same up to rounding. Policies and buffers that the engine does not support (with
-            dropout, frozen parameters, dictionary observations, ...) run SB3's own loop.
+            dropout, frozen parameters, dictionary observations, ...) run the stock loop.
         **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that
             successive actions are independent.
 
@@ -85,7 +85,7 @@ class PPOFlow(PPO):
         check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
         self.compile: bool | Literal["auto"] = compile
         self._runtime = EngineRuntime(
-            [self], why_ppo_unsupported, build_ppo_engine, warn_of_sb3s_loop
+            [self], why_ppo_unsupported, build_ppo_engine, warn_of_stock_loop
         )
         super().__init__(*args, **kwargs)
 

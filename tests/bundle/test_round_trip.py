@@ -105,7 +105,7 @@ def update(model: SACFlow, buffer: Any) -> None:
     model.train(3, batch_size=16)
 
 
-@pytest.mark.filterwarnings("ignore:training runs SB3's own loop")
+@pytest.mark.filterwarnings("ignore:training runs the stock loop")
 @pytest.mark.parametrize("case", CASES)
 def test_acts_and_learns_on_as_if_never_saved(case: str, tmp_path: Path) -> None:
     model = CASES[case]().learn(60)

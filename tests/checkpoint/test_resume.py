@@ -181,7 +181,7 @@ def test_action_noise_goes_on(tmp_path: Path) -> None:
 
 
 def test_state_dependent_exploration_on_sb3s_own_loop(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="SB3's own loop"):
+    with pytest.warns(UserWarning, match="the stock loop"):
         assert differences(lambda: gym.make(ENV), tmp_path, policy=SACPolicy, use_sde=True) == []
 
 

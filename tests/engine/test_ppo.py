@@ -156,7 +156,9 @@ class _FreezeOnce(BaseCallback):
 def test_the_engine_steps_aside_for_what_it_does_not_support() -> None:
     model = PPOFlow("GaussPolicy", ENV, compile=False, **SMALL).learn(150)
     assert model._runtime._engine is not None
-    with pytest.warns(UserWarning, match="does not do parameters that are frozen or have hooks"):
+    with pytest.warns(
+        UserWarning, match="does not support parameters that are frozen or have hooks"
+    ):
         model.learn(300, callback=_FreezeOnce())
     assert why_ppo_unsupported(model) == "parameters that are frozen or have hooks"
     assert model._runtime._engine is None

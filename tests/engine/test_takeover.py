@@ -127,7 +127,7 @@ def test_replaced_objects_are_noticed(what: str) -> None:
 )
 def test_what_the_engine_cannot_do_is_left_to_sb3(policy_kwargs: dict, reason: str) -> None:
     model = make(SACFlow, "FlowPolicy", th.float32, policy_kwargs=policy_kwargs)
-    with pytest.warns(UserWarning, match=f"the engine does not do {reason}"):
+    with pytest.warns(UserWarning, match=f"the engine does not support {reason}"):
         model.train(1, batch_size=BATCH_SIZE)
 
 
@@ -274,7 +274,7 @@ def test_losses_of_the_actor_are_logged_when_it_is_updated() -> None:
 
 def test_crossq_without_normalization_is_left_to_sb3_contrib() -> None:
     model = make(CrossQFlow, "FlowPolicy", th.float32, policy_kwargs={"batch_norm": False})
-    with pytest.warns(UserWarning, match="not do CrossQ without batch renormalization"):
+    with pytest.warns(UserWarning, match="not support CrossQ without batch renormalization"):
         model.train(1, batch_size=BATCH_SIZE)
 
 

@@ -75,7 +75,7 @@ def run(path: Path, outputs: list[str], feed: dict[str, np.ndarray]) -> list[np.
     return session.run(outputs, feed)
 
 
-@pytest.mark.filterwarnings("ignore:training runs SB3's own loop")
+@pytest.mark.filterwarnings("ignore:training runs the stock loop")
 @pytest.mark.parametrize(
     ("kind", "form"),
     [

@@ -192,7 +192,7 @@ def spoil(model: SACFlow, column: str, row: int, value: float) -> None:
         ("actions", -np.inf, "critic_loss"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:training runs SB3's own loop")
+@pytest.mark.filterwarnings("ignore:training runs the stock loop")
 def test_training_stops_and_goes_back(
     column: str, value: float, loss: str, optimizer: type[th.optim.Optimizer]
 ) -> None:
@@ -353,6 +353,6 @@ def test_logger_of_a_run_without_updates_is_not_looked_at() -> None:
     env = make_vec_env("Pendulum-v1")
     model = SACFlow("GaussPolicy", env, ent_coef=0.1, **{**SEEDED, "policy_kwargs": kwargs})
     model.set_logger(configure(None, []))
-    with pytest.warns(UserWarning, match="SB3's own loop"):
+    with pytest.warns(UserWarning, match="the stock loop"):
         model.learn(15)
     assert model._n_updates == 5
