@@ -114,8 +114,14 @@ def vary(
         agents: Names of the agents to keep. Default: all.
 
     Raises:
-        ValueError: If there is no such agent.
+        ValueError: If there is no such agent, or the environments do not take these arguments.
     """
+    for setting in experiment.settings if env_kwargs else ():
+        register_env(setting.env_id)
+        try:
+            gym.make(setting.env_id, **{**setting.env_kwargs, **env_kwargs}).close()
+        except TypeError as error:
+            raise ValueError(f"--set must name arguments of {setting.env_id}: {error}") from None
     names = [agent.name for agent in experiment.agents]
     for name in agents or ():
         if name not in names:
