@@ -334,11 +334,13 @@ class SeedBatch:
             **self._experience.state(),
             "episodes": self._episodes.state(),
             "losses": self._losses,
+            "logged": tuple(self._logged),
             "engine": self._runtime.state(),
         }
 
     def _set_extra_state(self, state: dict[str, Any]) -> None:
         self._losses = state["losses"]
+        self._logged = state.get("logged", LOSSES)  # older checkpoints are of SACFlow
         self._runtime.load_state(state["engine"])
         self._experience.set_state(state)
         self._episodes.set_state(state["episodes"])
