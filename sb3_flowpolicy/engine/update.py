@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -78,7 +79,7 @@ LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 """What SB3 logs of an update: the rows of the tensor (4, S) that an update returns."""
 
 
-class Objective:
+class Objective(ABC):
     """What an algorithm makes of the critics' outputs, (S, C, B, Q): Q numbers per row and critic.
 
     Objectives are compared by value, as their constants are compiled into the update.
@@ -93,17 +94,17 @@ class Objective:
     networks_type: ClassVar[type[StackedNetworks]] = StackedNetworks
     """How they are evaluated."""
 
+    @abstractmethod
     def next_values(self, outputs: th.Tensor) -> th.Tensor:
         """Return what target critics say about the next observations, (S, B, T)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def critic_loss(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """Return the loss (S,) of critics whose outputs are compared with targets (S, B, T)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def actor_values(self, outputs: th.Tensor) -> th.Tensor:
         """Return the values (S, B) that the actor maximizes."""
-        raise NotImplementedError
 
     def why_unsupported(self, policy: Any) -> str | None:
         """Return what about a policy is not supported, besides what no algorithm supports."""
