@@ -17,6 +17,7 @@ from torch import nn
 from sb3_flowpolicy.common.validation import integer
 from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
 from sb3_flowpolicy.policies.sb3_distribution import ActionDistributionAdapter
+from sb3_flowpolicy.policies.traced import TracedCalls
 
 # State dicts omit this prefix, so that the heads have the names of SB3's `mu` and `log_std`, and a
 # Gauss actor and a stock SAC actor can load each other's checkpoints.
@@ -84,6 +85,7 @@ class FlowActor(Actor):
                 f"got {sorted(clashes)}"
             )
         self.density = TanhSquashed(density)
+        self.traced = TracedCalls()
         self.action_dist = ActionDistributionAdapter(self.density)  # type: ignore[assignment]
         self.register_state_dict_post_hook(_lift_heads)
         self.register_load_state_dict_pre_hook(_lower_heads)
@@ -122,6 +124,14 @@ class FlowActor(Actor):
             return self.density.mode(context)
         noise = self.draw_noise(context) if noise is None else noise
         return self.density.rsample(context, noise)
+
+    def act(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """Return the same actions as :meth:`forward`, sooner; gradients must be disabled."""
+        features = self.extract_features(obs, self.features_extractor)
+        modules = (self.latent_pi, self.density)
+        if deterministic:
+            return self.traced(_mode, modules, features)
+        return self.traced(_sample, modules, features, self.draw_noise(features))
 
     def action_log_prob(
         self, obs: PyTorchObs, noise: th.Tensor | None = None
@@ -185,6 +195,16 @@ class FlowActor(Actor):
         unit = centered / centered.norm(dim=-1, keepdim=True).clamp_min(tiny)
         correlation = (unit @ unit.mT).clamp(-1, 1)
         return correlation.diagonal_scatter(th.ones_like(correlation[..., 0]), dim1=-2, dim2=-1)
+
+
+def _mode(latent_pi: nn.Module, density: TanhSquashed, features: th.Tensor) -> th.Tensor:
+    return density.mode(latent_pi(features))
+
+
+def _sample(
+    latent_pi: nn.Module, density: TanhSquashed, features: th.Tensor, noise: th.Tensor
+) -> th.Tensor:
+    return density.rsample(latent_pi(features), noise)
 
 
 def _lift_heads(

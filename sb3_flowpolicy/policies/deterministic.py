@@ -7,7 +7,9 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
+from sb3_flowpolicy.distributions import TanhSquashed
 from sb3_flowpolicy.policies.actor import FlowActor
 
 MODES = ("base", "log_prob", "q")
@@ -31,19 +33,42 @@ def best_actions(
     References:
         Thesis section 2.2.3, on the base mean as a flow's deterministic action.
     """
-    context = actor.context(obs)
-    by_value = mode == "q"
-    features = critic.extract_features(obs, critic.features_extractor) if by_value else context
-    noise = candidate_noise(n_candidates, actor.density.noise_dim).to(context)
+    features = actor.extract_features(obs, actor.features_extractor)
+    noise = candidate_noise(n_candidates, actor.density.noise_dim).to(features).unsqueeze(1)
     rows = max(1, _MOST_AT_ONCE // n_candidates)
-    chosen = []
-    for h, seen in zip(context.split(rows), features.split(rows), strict=True):
-        shape = (n_candidates, len(h), actor.density.noise_dim)
-        actions, score = actor.density.rsample_and_log_prob(h, noise.unsqueeze(1).expand(shape))
-        if by_value:
-            score = critic_values(critic, seen.expand(n_candidates, *seen.shape), actions).amin(0)
-        chosen.append(actions[score.argmax(0), th.arange(len(h), device=h.device)])
-    return th.cat(chosen)
+    modules = (actor.latent_pi, actor.density)
+    if mode == "log_prob":
+        return th.cat(
+            [actor.traced(_most_likely, modules, part, noise) for part in features.split(rows)]
+        )
+    seen = critic.extract_features(obs, critic.features_extractor)
+    parts = zip(features.split(rows), seen.split(rows), strict=True)
+    return th.cat([actor.traced(_most_valued, (*modules, critic), *part, noise) for part in parts])
+
+
+def _most_likely(
+    latent_pi: nn.Module, density: TanhSquashed, features: th.Tensor, noise: th.Tensor
+) -> th.Tensor:
+    actions, log_prob = density.rsample_and_log_prob(latent_pi(features), noise)
+    return _best(actions, log_prob)
+
+
+def _most_valued(
+    latent_pi: nn.Module,
+    density: TanhSquashed,
+    critic: Any,
+    features: th.Tensor,
+    seen: th.Tensor,
+    noise: th.Tensor,
+) -> th.Tensor:
+    actions = density.rsample(latent_pi(features), noise)
+    values = critic_values(critic, seen.expand(*noise.shape[:1], *seen.shape), actions)
+    return _best(actions, values.amin(0))
+
+
+def _best(actions: th.Tensor, score: th.Tensor) -> th.Tensor:
+    """Take the actions with the highest scores: (N, batch, D), (N, batch) -> (batch, D)."""
+    return actions.take_along_dim(score.argmax(0, keepdim=True).unsqueeze(-1), 0).squeeze(0)
 
 
 def critic_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:

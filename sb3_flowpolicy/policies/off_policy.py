@@ -96,8 +96,10 @@ class DistributionPolicy(DensityPolicy):
         self._deterministic_mode = one_of(*modes)("deterministic_mode", mode)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        if not deterministic or self.deterministic_mode == "base":
+        if self._uses_sde:
             return super()._predict(observation, deterministic)  # type: ignore[safe-super]
+        if not deterministic or self.deterministic_mode == "base":
+            return self.actor.act(observation, deterministic)
         mode, n_candidates = self.deterministic_mode, self.deterministic_samples
         return best_actions(self.actor, self.critic, observation, mode, n_candidates)
 

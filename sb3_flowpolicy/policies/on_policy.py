@@ -8,12 +8,13 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_flowpolicy.common.validation import flag, number
-from sb3_flowpolicy.distributions import TanhSquashed, make_distribution
+from sb3_flowpolicy.distributions import ActionDistribution, TanhSquashed, make_distribution
 from sb3_flowpolicy.distributions.gaussian import LogStdHead
 from sb3_flowpolicy.distributions.loc_scale import StateIndependent, with_heads
 from sb3_flowpolicy.policies.base import (
@@ -28,6 +29,7 @@ from sb3_flowpolicy.policies.sb3_distribution import (
     ActionDistributionAdapter,
     estimate_entropy,
 )
+from sb3_flowpolicy.policies.traced import TracedCalls
 
 # Bound on the gradient of the loss with respect to a log-probability, which in PPO is advantage
 # times ratio. A larger gradient only says that the policy has left the actions it is judged by.
@@ -116,10 +118,19 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         density = TanhSquashed(density) if self._squashes else density
         self.action_net: nn.Module = density.to(self.device)
         self.action_dist = ActionDistributionAdapter(density)
+        self.traced = TracedCalls()
         with th.no_grad():
             self._has_exact_entropy = density.entropy(th.zeros(1, features)) is not None
         parameters, rate = self.parameters(), lr_schedule(1)
         self.optimizer = self.optimizer_class(parameters, lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        features = BasePolicy.extract_features(self, observation, self.pi_features_extractor)
+        modules = (self.mlp_extractor, self.action_net)
+        if deterministic:
+            return self.traced(_mode, modules, features)
+        noise = self.action_dist.density.draw_noise(features)
+        return self.traced(_sample, modules, features, noise)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Return actions, which must be finite, values and log-probabilities, as SB3 does."""
@@ -198,6 +209,16 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
             "squash_output": self._squashes,
             "state_dependent_std": self.state_dependent_std,
         }
+
+
+def _mode(extractor: MlpExtractor, density: ActionDistribution, features: th.Tensor) -> th.Tensor:
+    return density.mode(extractor.forward_actor(features))
+
+
+def _sample(
+    extractor: MlpExtractor, density: ActionDistribution, features: th.Tensor, noise: th.Tensor
+) -> th.Tensor:
+    return density.rsample(extractor.forward_actor(features), noise)
 
 
 def bound_gradient(gradient: th.Tensor) -> th.Tensor:

@@ -22,6 +22,8 @@ class FlowLstmPolicy(FlowActorCriticPolicy, RecurrentActorCriticPolicy):
         >>> _ = model.learn(64)
     """
 
+    _predict = RecurrentActorCriticPolicy._predict  # type: ignore[assignment]
+
     def __init__(self, *args: Any, squash_output: bool = False, **kwargs: Any) -> None:
         if squash_output:
             raise ValueError(
