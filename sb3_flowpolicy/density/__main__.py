@@ -14,7 +14,7 @@ EPILOG = """examples:
   python -m sb3_flowpolicy.density list
   python -m sb3_flowpolicy.density run two-moons-label          one study, ten seeds
   python -m sb3_flowpolicy.density run --quick                  everything, as a test
-  python -m sb3_flowpolicy.density run --jobs 2 && python -m sb3_flowpolicy.density report
+  python -m sb3_flowpolicy.density run && python -m sb3_flowpolicy.density report
 """
 DEFAULT_FOLDER = Path("density_results")
 
@@ -29,14 +29,13 @@ def main(arguments: list[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="list|run|report")
-    actions.add_parser("list", help="show the studies, the thesis's findings and the criteria")
+    actions.add_parser("list", help="show the studies and the thesis's findings")
     run = actions.add_parser("run", help="fit, measure and draw; tables and pictures go to --out")
     add = run.add_argument
     add("names", nargs="*", metavar="NAME", help="studies (default: all)")
     add("--seeds", type=at_least(1), default=10, help="number of seeds (default: 10)")
     add("--first-seed", type=at_least(0), default=0, help="first seed (default: 0)")
     add("--quick", action="store_true", help="two seeds, hardly trained, within a minute")
-    add("--jobs", type=at_least(1), default=1, help="models fitted at the same time (default: 1)")
     report = actions.add_parser("report", help="write README.md next to the results, and print it")
     for sub in (run, report):
         folder = f"folder of the results (default: {DEFAULT_FOLDER})"
@@ -56,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
         for study in STUDIES.values():
             print(f"{study.name} ({study.claim}): {study.title}")
             print(f"  models: {', '.join(study.epochs)}")
-            print(f"  thesis: {study.thesis}\n  criteria: {study.rules}\n")
+            print(f"  thesis: {study.thesis}\n")
         return
     try:
         if args.action == "report":
@@ -68,7 +67,6 @@ def main(arguments: list[str] | None = None) -> None:
             range(args.first_seed, args.first_seed + (2 if args.quick else args.seeds)),
             QUICK if args.quick else FULL,
             args.out,
-            args.jobs,
         )
         took = f"{(time.monotonic() - begin) / 60:.1f} minutes"
         given = sys.argv[1:] if arguments is None else arguments

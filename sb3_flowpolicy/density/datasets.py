@@ -23,10 +23,10 @@ CELLS_PER_NOISE, MARGIN_IN_NOISE = 2, 8
 
 
 class Sample(NamedTuple):
-    """Points (N, 2) and their conditions (N, C); C = 0 without conditions."""
+    """Points and their conditions; C = 0 without conditions."""
 
-    points: np.ndarray
-    condition: np.ndarray
+    points: np.ndarray  # (N, 2)
+    condition: np.ndarray  # (N, C)
 
 
 class Scaler(NamedTuple):
@@ -63,6 +63,10 @@ class TwoMoons:
     def __init__(self, labelled: bool = False) -> None:
         self.labelled = labelled
         self.condition_dim = int(labelled)
+
+    def conditions(self, n: int) -> np.ndarray:
+        """Return the conditions whose densities are integrated, (K, C)."""
+        return np.array([[0.0], [1.0]]) if self.labelled else np.zeros((1, 0))
 
     def draw(self, n: int, seed: int) -> Sample:
         """Draw n points, half of them from each moon."""
@@ -112,6 +116,10 @@ class AngleMoons:
     def __init__(self, angles: np.ndarray = TRAINING_ANGLES) -> None:
         self.angles = np.asarray(angles, dtype=float)
 
+    def conditions(self, n: int) -> np.ndarray:
+        """Return the conditions of n angles over the full circle, (n, 2)."""
+        return angle_condition(np.arange(n) * 2 * np.pi / n)
+
     def draw(self, n: int, seed: int) -> Sample:
         """Draw at least n points, equally many from each half circle."""
         per_angle = -(-n // len(self.angles))
@@ -154,11 +162,7 @@ def moon_log_density(points: np.ndarray) -> np.ndarray:
     .. math:: p(x) = \frac{1}{\pi} \int_0^\pi
         \mathcal N\bigl(x; (\cos t, \sin t), \sigma^2 I\bigr)\, dt
 
-    Args:
-        points: Points x, shape (N, 2).
-
-    Returns:
-        log p(x) in nats, shape (N,).
+    Shapes: points (N, 2) -> log p in nats (N,).
 
     Example:
         >>> on_the_arc, beside = moon_log_density(np.array([[0.0, 1.0], [0.0, 0.0]]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import pandas as pd
 import torch as th
 from torch.func import functional_call, stack_module_state, vmap
 from torch.optim.lr_scheduler import OneCycleLR
@@ -43,13 +44,11 @@ class Ensemble:
         self.name, self.condition_dim, self.seeds = name, condition_dim, list(seeds)
         models = [make_model(name, condition_dim, seed) for seed in seeds]
         self._template = models[0]
-        self.weights: Weights = stack_module_state(models)[0]
+        self.weights, buffers = stack_module_state(models)
         # Buffers such as masks. Equal ones are not stacked: zuko's couplings index by their masks,
         # which vmap cannot do.
-        each = [dict(model.named_buffers()) for model in models]
-        stacks = {key: th.stack([one[key] for one in each]) for key in each[0]}
-        self._own = {key: value for key, value in stacks.items() if (value != value[:1]).any()}
-        self._shared = {key: value for key, value in each[0].items() if key not in self._own}
+        self._own = {key: value for key, value in buffers.items() if (value != value[:1]).any()}
+        self._shared = {key: value[0] for key, value in buffers.items() if key not in self._own}
 
     def log_prob(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
         """Score other points with each copy: (S, N, 2), (S, N, C) -> (S, N), in nats."""
@@ -75,19 +74,10 @@ def _of(states: Weights, index: int) -> Weights:
 
 
 class Data(NamedTuple):
-    """Samples of S seeds in the units of the models: points (S, N, 2) and conditions (S, N, C)."""
+    """Samples of S seeds in the units of the models."""
 
-    points: th.Tensor
-    condition: th.Tensor
-
-
-class Curves(NamedTuple):
-    """Mean negative log-likelihoods in nats at T checks during the training of S seeds."""
-
-    epoch: th.Tensor  # (T,)
-    train: th.Tensor  # (T, S)
-    validation: th.Tensor  # (T, S)
-    best_epoch: th.Tensor  # (S,)
+    points: th.Tensor  # (S, N, 2)
+    condition: th.Tensor  # (S, N, C)
 
 
 def fit(
@@ -97,7 +87,7 @@ def fit(
     epochs: int,
     seed: int = 0,
     check_every: int = 10,
-) -> Curves:
+) -> pd.DataFrame:
     """Train an ensemble and keep the weights with the best validation of each seed.
 
     Args:
@@ -106,7 +96,11 @@ def fit(
         validation: Validation sample of each seed. Report likelihoods of a third sample.
         epochs: Passes over the training sample.
         seed: Seed of the order of the points.
-        check_every: Epochs between two evaluations of the validation sample.
+        check_every: Epochs between two evaluations of both samples.
+
+    Returns:
+        Mean negative log-likelihoods in nats, a row for each seed and check: ``seed``, ``epoch``,
+        ``train``, and ``other`` of the validation sample.
 
     References:
         Noise Regularization for Conditional Density Estimation (Rothfuss et al., 2019);
@@ -119,8 +113,8 @@ def fit(
     schedule = OneCycleLR(optimizer, LEARNING_RATE, total_steps=BATCHES_PER_EPOCH * epochs)
     average = {name: value.detach().clone() for name, value in raw.items()}
     best = {name: value.clone() for name, value in average.items()}
-    best_nll, best_epoch = th.full((n_seeds,), th.inf), th.zeros(n_seeds, dtype=th.long)
-    rows: list[tuple[int, th.Tensor, th.Tensor]] = []
+    best_nll = th.full((n_seeds,), th.inf)
+    checks = []
 
     for epoch in range(1, epochs + 1):
         keys = th.rand(n_seeds, n_points, generator=generator)
@@ -138,16 +132,16 @@ def fit(
         if epoch % check_every and epoch != epochs:
             continue
         ensemble.weights = average
-        nll = mean_nll(ensemble, validation)
-        rows.append((epoch, mean_nll(ensemble, train), nll))
+        nll, train_nll = mean_nll(ensemble, validation), mean_nll(ensemble, train)
+        columns = {"train": train_nll.double().numpy(), "other": nll.double().numpy()}
+        checks.append(pd.DataFrame({"seed": ensemble.seeds, "epoch": epoch, **columns}))
         ensemble.weights = raw
         better = nll < best_nll
-        best_nll, best_epoch = th.where(better, nll, best_nll), best_epoch.where(~better, epoch)
+        best_nll = th.where(better, nll, best_nll)
         for name, value in best.items():
             value[better] = average[name][better]
     ensemble.weights = best
-    checked, train_nll, validation_nll = zip(*rows, strict=True)
-    return Curves(th.tensor(checked), th.stack(train_nll), th.stack(validation_nll), best_epoch)
+    return pd.concat(checks).sort_values(["seed", "epoch"], ignore_index=True)
 
 
 @th.no_grad()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch as th
 from scipy.stats import sem
 
-from sb3_flowpolicy.density.datasets import AngleMoons, Sample, Scaler
+from sb3_flowpolicy.density.datasets import AngleMoons, DataSet, Sample, Scaler
 from sb3_flowpolicy.density.fit import Data, Ensemble, fit, mean_nll
 from sb3_flowpolicy.density.models import FlowModel
 from sb3_flowpolicy.density.studies import STUDIES, Scale, angles_to_score
@@ -21,10 +21,11 @@ VALIDATION_SEED, HELDOUT_SEED, ANGLE_SEED = 100_000, 200_000, 300_000
 REACH = 5.0
 # Grid points scored at once.
 CHUNK = 80_000
+# Points (N, 2) and conditions (N, C) -> log-densities in nats (N,), such as a model.
+LogProb = Callable[[th.Tensor, th.Tensor], th.Tensor]
 
 
-@dataclass(frozen=True)
-class Fitted:
+class Fitted(NamedTuple):
     """A trained ensemble, the scalers of its seeds' points, and the tables of its scores."""
 
     model: str
@@ -37,12 +38,16 @@ class Fitted:
     @property
     def middle(self) -> int:
         """Index of the seed with the median likelihood, which the pictures show."""
-        order = np.argsort(self.fits["nll"].to_numpy(), kind="stable")
-        return int(order[(len(order) - 1) // 2])
+        return int(self.fits["nll"].argsort(stable=True).iloc[(len(self.fits) - 1) // 2])
 
     def middle_model(self) -> FlowModel:
         """Return the model of that seed."""
         return self.ensemble.member(self.middle)
+
+    def middle_data(self, data: DataSet) -> tuple[Scaler, Sample]:
+        """Return the scaler and the training sample of that seed."""
+        sample = data.draw(data.n_train, self.ensemble.seeds[self.middle])
+        return self.scalers[self.middle], sample
 
 
 def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Scale) -> Fitted:
@@ -58,13 +63,14 @@ def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Sc
     train_data, held = as_data(train, scalers), as_data(heldout, scalers)
     epochs = max(2, study.epochs[model] // scale.shrink)
     curves = fit(ensemble, train_data, as_data(validation, scalers), epochs, seed=min(seeds))
+    best = curves.loc[curves.groupby("seed")["other"].idxmin()].set_index("seed")
     log_p = np.stack([data.log_density(sample) for sample in heldout])
     with th.no_grad():
         log_q = ensemble.log_prob(held.points, held.condition).double().numpy()
     # Of the standardized points, as the model sees them.
     log_volume = np.array([scaler.log_volume for scaler in scalers])
     gap = log_p + log_volume[:, None] - log_q
-    conditions = th.from_numpy(study.conditions(scale)).float()
+    conditions = th.from_numpy(data.conditions(scale.integral_angles)).float()
     integrals = [
         [integral(ensemble.member(i), one, scale.cells) for one in conditions]
         for i in range(len(seeds))
@@ -74,7 +80,7 @@ def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Sc
             "study": study_name,
             "model": model,
             "seed": list(seeds),
-            "best_epoch": curves.best_epoch.numpy(),
+            "best_epoch": best["epoch"][list(seeds)].to_numpy(),
             "train_nll": mean_nll(ensemble, train_data).double().numpy(),
             "nll": -log_q.mean(1),
             "nll_se": sem(log_q, axis=1),
@@ -86,18 +92,9 @@ def fit_and_measure(study_name: str, model: str, seeds: Sequence[int], scale: Sc
             "accuracy": _accuracy(ensemble, held) if study_name == "two-moons-label" else None,
         }
     )
-    n_checks = len(curves.epoch)
-    progress = pd.DataFrame(
-        {
-            "model": model,
-            "seed": np.repeat(seeds, n_checks),
-            "epoch": np.tile(curves.epoch, len(seeds)),
-            "train": curves.train.double().T.flatten(),
-            "other": curves.validation.double().T.flatten(),
-        }
-    )
+    curves.insert(0, "model", model)
     angles = _angles(ensemble, scale) if study_name == "angle-moons" else pd.DataFrame()
-    return Fitted(model, ensemble, scalers, fits, progress, angles)
+    return Fitted(model, ensemble, scalers, fits, curves, angles)
 
 
 def as_data(samples: Sequence[Sample], scalers: Sequence[Scaler]) -> Data:
@@ -108,9 +105,7 @@ def as_data(samples: Sequence[Sample], scalers: Sequence[Scaler]) -> Data:
 
 
 @th.no_grad()
-def label_posterior(
-    log_prob: Callable[[th.Tensor, th.Tensor], th.Tensor], points: th.Tensor
-) -> th.Tensor:
+def label_posterior(log_prob: LogProb, points: th.Tensor) -> th.Tensor:
     """Return p(label = 1 | point) for equally frequent labels: points (*, 2) -> (*)."""
     label = th.zeros_like(points[..., :1])
     return th.sigmoid(log_prob(points, label + 1) - log_prob(points, label))
@@ -123,19 +118,14 @@ def _accuracy(ensemble: Ensemble, held: Data) -> np.ndarray:
 
 
 @th.no_grad()
-def integral(model: FlowModel, condition: th.Tensor, cells: int) -> float:
+def integral(log_prob: LogProb, condition: th.Tensor, cells: int) -> float:
     r"""Integrate a density over the plane.
 
     .. math:: \int p(x)\,dx = \int p(\sinh u) \cosh u_1 \cosh u_2\, du
 
-    Near the origin, where the data lie, the cells are 0.0125 wide, a quarter of the noise of the
-    data. The integral reveals a wrong log-determinant, and mass that a flow loses because one of
-    its layers does not reach the whole plane.
-
-    Args:
-        model: The density.
-        condition: Its condition, shape (C,).
-        cells: Grid points per axis.
+    With 700 cells per axis, those near the origin, where the data lie, are as narrow as a quarter
+    of the data's noise. The integral reveals a wrong log-determinant, and mass that a flow loses
+    because one of its layers does not reach the whole plane. The condition has the shape (C,).
 
     Example:
         >>> from sb3_flowpolicy.density.models import make_model
@@ -147,7 +137,7 @@ def integral(model: FlowModel, condition: th.Tensor, cells: int) -> float:
     log_cell = th.cartesian_prod(u.cosh().log(), u.cosh().log()).sum(1)
     total = 0.0
     for part, log_size in zip(points.split(CHUNK), log_cell.split(CHUNK), strict=True):
-        log_p = model(part, condition.expand(len(part), -1))
+        log_p = log_prob(part, condition.expand(len(part), -1))
         total += (log_p.double() + log_size).exp().sum().item()
     return total * (2 * REACH / (cells - 1)) ** 2
 

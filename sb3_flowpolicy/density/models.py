@@ -1,9 +1,9 @@
-"""The models of the chapter, ours and zuko's, with one interface."""
+"""The models of the chapter, ours and zuko's, with the same methods."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -18,23 +18,8 @@ LAYERS, HIDDEN = 8, (10, 10)
 ENCODER_UNITS = 16
 
 
-class FlowModel(nn.Module, ABC):
-    """A density over the plane, given a condition of C numbers (C = 0: none)."""
-
-    # Whether torch.func.vmap can evaluate many copies at once.
-    stackable = True
-
-    @abstractmethod
-    def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """Return log p(points | condition) in nats: (N, 2), (N, C) -> (N,)."""
-
-    @abstractmethod
-    def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """Turn standard normal noise (N, 2) and conditions (N, C) into points (N, 2)."""
-
-
-class OurRealNVP(FlowModel):
-    """The policy's flow with a linear encoder of the condition; without one, the context is 1.
+class OurRealNVP(nn.Module):
+    """The policy's flow with a linear encoder of C conditions; with C = 0, the context is 1.
 
     Example:
         >>> model = OurRealNVP(condition_dim=0)
@@ -43,6 +28,9 @@ class OurRealNVP(FlowModel):
         True
     """
 
+    # Whether torch.func.vmap can evaluate many copies at once.
+    stackable = True
+
     def __init__(self, condition_dim: int) -> None:
         super().__init__()
         self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
@@ -50,11 +38,11 @@ class OurRealNVP(FlowModel):
         self.flow = RealNVP(2, context_dim, layers=LAYERS, hidden=HIDDEN)
 
     def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
+        """Return log p(points | condition) in nats: (N, 2), (N, C) -> (N,)."""
         return self.flow.log_prob(self._context(condition), points)
 
     def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
+        """Turn standard normal noise (N, 2) and conditions (N, C) into points (N, 2)."""
         return self.flow.rsample(self._context(condition), noise)
 
     def _context(self, condition: th.Tensor) -> th.Tensor:
@@ -67,19 +55,17 @@ class OurRealNVP(FlowModel):
         """Return the noise and its image after each coupling, L + 1 tensors (N, 2)."""
         images = [noise]
         shares = list(self.flow.context_proj(self._context(condition)).chunk(LAYERS, dim=-1))
-        value = noise
+        halves = list(noise.split(1, dim=-1))
         for pair in self.flow.pairs:
-            halves = list(value.split(1, dim=-1))
             for turn, coupling in enumerate(pair.couplings):
                 outputs = coupling(halves[turn], shares.pop(0))
                 halves[1 - turn], _ = coupling.move(halves[1 - turn], outputs)
-                value = th.cat(halves, dim=-1)
-                images.append(value)
+                images.append(th.cat(halves, dim=-1))
         return images
 
 
-class ZukoModel(FlowModel):
-    """A flow from zuko (Rozet et al., 2022) with the same linear encoder.
+class ZukoModel(nn.Module):
+    """A flow from zuko (Rozet et al., 2022) with the same encoder and methods.
 
     Args:
         flow: Name of a class in ``zuko.flows``.
@@ -93,21 +79,25 @@ class ZukoModel(FlowModel):
         zuko = import_module("zuko")
         self.encoder = nn.Linear(condition_dim, ENCODER_UNITS) if condition_dim else None
         self.flow = getattr(zuko.flows, flow)(2, ENCODER_UNITS if condition_dim else 0, **settings)
+        self.stackable = flow != "NAF"
 
     def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
+        """See :class:`OurRealNVP`."""
         return self._given(condition).log_prob(points)
 
     def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """See :class:`FlowModel`."""
+        """See :class:`OurRealNVP`."""
         return self._given(condition).transform.inv(noise)
 
     def _given(self, condition: th.Tensor) -> Any:
         return self.flow(None if self.encoder is None else self.encoder(condition))
 
 
-class ZukoNAF(ZukoModel):
-    """zuko's neural autoregressive flow, with initial weights close to the identity.
+FlowModel = OurRealNVP | ZukoModel
+
+
+def zuko_naf(condition_dim: int) -> ZukoModel:
+    """Return zuko's neural autoregressive flow, with initial weights close to the identity.
 
     A monotone network with one hidden layer of 16 units (Pyro's default) transforms each
     coordinate. With zuko's initial weights, eight layers compress the plane so much that most of
@@ -117,39 +107,37 @@ class ZukoNAF(ZukoModel):
     References:
         Neural Autoregressive Flows (Huang et al., 2018).
     """
-
-    stackable = False
-
-    def __init__(self, condition_dim: int) -> None:
-        network = {"hidden_features": (16,)}
-        super().__init__(
-            "NAF", condition_dim, transforms=LAYERS, hidden_features=HIDDEN, network=network
-        )
-        with th.no_grad():
-            for module in self.flow.modules():
-                if isinstance(module, import_module("zuko").flows.neural.MNN):
-                    # The networks use the absolute values of their weights. Their inputs are the
-                    # coordinate and 16 signals from the other coordinates.
-                    first, last = module.network[0], module.network[-1]
-                    first.weight[..., :1].uniform_(0.5, 2.0)
-                    first.weight[..., 1:].uniform_(0.0, 1.0)
-                    first.bias.uniform_(-2.0, 2.0)
-                    last.weight.abs_().div_(last.weight.sum(-1, keepdim=True))
-                    last.bias.zero_()
+    model = ZukoModel("NAF", condition_dim, **_SIZES, network={"hidden_features": (16,)})
+    networks = [
+        module.network
+        for module in model.flow.modules()
+        if isinstance(module, import_module("zuko").flows.neural.MNN)
+    ]
+    with th.no_grad():
+        for network in networks:
+            # The networks use the absolute values of their weights. Their inputs are the coordinate
+            # and 16 signals from the other coordinates.
+            first, last = network[0], network[-1]
+            first.weight[..., :1].uniform_(0.5, 2.0)
+            first.weight[..., 1:].uniform_(0.0, 1.0)
+            first.bias.uniform_(-2.0, 2.0)
+            last.weight.abs_().div_(last.weight.sum(-1, keepdim=True))
+            last.bias.zero_()
+    return model
 
 
-# Name -> (condition_dim -> model). Sizes are the thesis's. The spline flow is not in the thesis; it
-# has zuko's usual three transforms of eight bins.
+# The thesis's sizes. The spline flow is not in the thesis; it has zuko's usual three transforms of
+# eight bins.
+_SIZES: dict[str, Any] = {"transforms": LAYERS, "hidden_features": HIDDEN}
+# Name -> (condition_dim -> model).
 MODELS: dict[str, Callable[[int], FlowModel]] = {
     "realnvp": OurRealNVP,
-    "zuko-realnvp": lambda c: ZukoModel("RealNVP", c, transforms=LAYERS, hidden_features=HIDDEN),
-    "maf": lambda c: ZukoModel("MAF", c, transforms=LAYERS, hidden_features=HIDDEN),
+    "zuko-realnvp": partial(ZukoModel, "RealNVP", **_SIZES),
+    "maf": partial(ZukoModel, "MAF", **_SIZES),
     # In the plane, half of the random orders repeat the previous one and add little.
-    "maf-random": lambda c: ZukoModel(
-        "MAF", c, transforms=LAYERS, hidden_features=HIDDEN, randperm=True
-    ),
-    "naf": ZukoNAF,
-    "nsf": lambda c: ZukoModel("NSF", c, transforms=3, bins=8, hidden_features=HIDDEN),
+    "maf-random": partial(ZukoModel, "MAF", **_SIZES, randperm=True),
+    "naf": zuko_naf,
+    "nsf": partial(ZukoModel, "NSF", transforms=3, bins=8, hidden_features=HIDDEN),
 }
 
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.animation import FuncAnimation
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from PIL import Image
 from scipy.stats import trim_mean
 
 from sb3_flowpolicy.common.files import replacing
@@ -22,7 +21,7 @@ from sb3_flowpolicy.density.datasets import (
     TwoMoons,
     angle_condition,
 )
-from sb3_flowpolicy.density.measure import Fitted, label_posterior
+from sb3_flowpolicy.density.measure import Fitted, LogProb, label_posterior
 from sb3_flowpolicy.density.models import FlowModel, OurRealNVP
 from sb3_flowpolicy.density.studies import Scale
 
@@ -44,29 +43,25 @@ STYLES = {
 # Pictures show [-extent, extent]²: standardized moons, and half circles of radius 1.
 MOONS_EXTENT, ANGLES_EXTENT = 2.4, 1.5
 # Angles of the thesis's Fig. 2.9 and 2.10.
-BETWEEN = np.linspace(1.0, 1.2, 8)
-AROUND = np.arange(8) * np.pi / 4
+ANGLES = {"between": np.linspace(1.0, 1.2, 8), "outside": np.arange(8) * np.pi / 4}
 
 
 def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw curves (2.3), samples (2.4), densities (2.5) and layers (2.1)."""
-    ours = fits[0]
+    ours, data = fits[0], TwoMoons()
     _save(_curves_figure(fits, ours.fits["entropy"][0]), folder / "two-moons-curves.png")
-
-    data, scaler = TwoMoons(), ours.scalers[ours.middle]
-    points = scaler.apply(data.draw(data.n_train, ours.ensemble.seeds[ours.middle]).points)
+    scaler, train = ours.middle_data(data)
     plane = _pixel_centers(MOONS_EXTENT, scale.pixels).numpy().astype(float)
     raw = Sample(plane * scaler.scale + scaler.mean, np.zeros((len(plane), 0)))
     truth = np.exp(data.log_density(raw) + scaler.log_volume).reshape(scale.pixels, scale.pixels)
     for kind in ("samples", "density"):
         figure, panels = _grid_of_panels(len(fits) + 2, 4)
         _draw_density(panels[0], truth, MOONS_EXTENT, "true density")
-        _draw_points(panels[1], points, MOONS_EXTENT, "training data", GREY)
+        _draw_points(panels[1], scaler.apply(train.points), MOONS_EXTENT, "training data", GREY)
         for axes, fitted in zip(panels[2:], fits, strict=True):
             model, label = fitted.middle_model(), STYLES[fitted.model][0]
             if kind == "samples":
-                samples = _sample(model, np.zeros((data.n_train, 0)))
-                _draw_points(axes, samples, MOONS_EXTENT, label)
+                _draw_points(axes, _sample(model, train.condition), MOONS_EXTENT, label)
             else:
                 density = density_picture(model, np.zeros(0), MOONS_EXTENT, scale.pixels)
                 _draw_density(axes, density, MOONS_EXTENT, label)
@@ -77,29 +72,19 @@ def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
 def _curves_figure(fits: Sequence[Fitted], limit: float) -> Figure:
     """Draw likelihoods over epochs: every seed and the interquartile mean."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    panels = figure.subplots(1, 2, sharey=True)
     titles = {"train": "training sample", "other": "sample not trained on"}
-    for axes, (column, title) in zip((left, right), titles.items(), strict=True):
+    for axes, (column, title) in zip(panels, titles.items(), strict=True):
         for fitted in fits:
             label, color = STYLES[fitted.model]
             nll = fitted.curves.pivot(index="epoch", columns="seed", values=column)
             axes.plot(nll, color=color, linewidth=0.5, alpha=0.35)
             axes.plot(nll.index, trim_mean(nll, 0.25, axis=1), color=color, label=label)
-        axes.axhline(limit, color="black", linestyle="--", linewidth=1)
-        axes.annotate(
-            "entropy of the data: no model can be lower",
-            (0.98, limit),
-            (0, -4),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="right",
-            va="top",
-            fontsize=7,
-        )
+        axes.axhline(limit, color="black", linestyle="--", linewidth=1, label="entropy of the data")
         axes.set(xlabel="epoch", ylim=(limit - 0.15, limit + 1.0), title=title)
         axes.spines[["top", "right"]].set_visible(False)
-    left.set_ylabel("negative log-likelihood, nats")
-    right.legend(frameon=False, fontsize=8)
+    panels[0].set_ylabel("negative log-likelihood, nats")
+    panels[1].legend(frameon=False, fontsize=8)
     return figure
 
 
@@ -112,11 +97,11 @@ def _layers_figure(model: FlowModel) -> Figure:
     right, up = (noise.numpy() >= 0).T
     colors = np.array(["#2e8b57", "#e0a030", "#2f6db5", "#c0392b"])[2 * right + up]
     figure, panels = _grid_of_panels(len(images), 3)
+    titles = {0: "base: standard normal", len(images) - 1: "after layer 8: two moons"}
     for index, (axes, points) in enumerate(zip(panels, images, strict=True)):
         # Layers in between may shift and stretch all points: zoom each panel to its points.
         x, y = points.mean(0)
         extent = 1.05 * np.quantile(np.abs(points - [x, y]), 0.995)
-        titles = {0: "base: standard normal", len(images) - 1: "after layer 8: two moons"}
         axes.scatter(points[:, 0], points[:, 1], s=1.5, c=colors, linewidths=0, rasterized=True)
         axes.set(xlim=(x - extent, x + extent), ylim=(y - extent, y + extent))
         axes.set_title(titles.get(index, f"after layer {index}"), fontsize=8)
@@ -127,30 +112,23 @@ def draw_label(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw samples of both labels (2.7), and the probability of each label."""
     (fitted,) = fits
     data, model = TwoMoons(labelled=True), fitted.middle_model()
-    scaler = fitted.scalers[fitted.middle]
-    train = data.draw(data.n_train, fitted.ensemble.seeds[fitted.middle])
+    scaler, train = fitted.middle_data(data)
     colors = np.where(train.condition[:, 0] > 0.5, ORANGE, BLUE)
     figure, panels = _grid_of_panels(3, 3, size=2.8)
     _draw_points(panels[0], scaler.apply(train.points), MOONS_EXTENT, "training data", colors)
     samples = _sample(model, train.condition)
     _draw_points(panels[1], samples, MOONS_EXTENT, "RealNVP, given the label", colors)
 
-    axes = panels[2]
-    posterior = label_posterior(model, _pixel_centers(MOONS_EXTENT, scale.pixels))
-    axes.imshow(
-        posterior.reshape(scale.pixels, scale.pixels).numpy(),
-        origin="lower",
-        extent=(-MOONS_EXTENT, MOONS_EXTENT, -MOONS_EXTENT, MOONS_EXTENT),
-        cmap=LinearSegmentedColormap.from_list("labels", ["#cfe0f0", "#ffffff", "#f6d9c8"]),
-        vmin=0,
-        vmax=1,
-    )
+    posterior = label_posterior(model, _pixel_centers(MOONS_EXTENT, scale.pixels)).numpy()
+    colormap = LinearSegmentedColormap.from_list("labels", ["#cfe0f0", "#ffffff", "#f6d9c8"])
+    image = posterior.reshape(scale.pixels, scale.pixels)
+    _draw_image(panels[2], image, MOONS_EXTENT, colormap)
     fresh = data.draw(1000, PICTURE_SEED)
     x, second = scaler.apply(fresh.points), fresh.condition[:, 0] > 0.5
     wrong = (label_posterior(model, th.from_numpy(x).float()).numpy() > 0.5) != second
     title = f"more likely label; {wrong.sum()} of {len(x)} new points wrong"
-    _draw_points(axes, x, MOONS_EXTENT, title, np.where(second, ORANGE, BLUE))
-    axes.scatter(x[wrong, 0], x[wrong, 1], s=30, facecolors="none", edgecolors="black")
+    _draw_points(panels[2], x, MOONS_EXTENT, title, np.where(second, ORANGE, BLUE))
+    panels[2].scatter(x[wrong, 0], x[wrong, 1], s=30, facecolors="none", edgecolors="black")
     _save(figure, folder / "label-samples.png")
 
 
@@ -159,8 +137,7 @@ def draw_angles(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     (fitted,) = fits
     _save(_angle_nll_figure(fitted), folder / "angles-likelihood.png")
 
-    data, model = AngleMoons(), fitted.middle_model()
-    train = data.draw(data.n_train, fitted.ensemble.seeds[fitted.middle])
+    model, (_, train) = fitted.middle_model(), fitted.middle_data(AngleMoons())
     color = np.arctan2(train.condition[:, 0], train.condition[:, 1])
     samples = _sample(model, train.condition)
     figure, panels = _grid_of_panels(2, 2, size=2.8)
@@ -168,7 +145,7 @@ def draw_angles(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     _draw_points(panels[1], samples, ANGLES_EXTENT, "RealNVP, given the angle", color)
     _save(figure, folder / "angles-samples.png")
 
-    for name, angles in (("between", BETWEEN), ("outside", AROUND)):
+    for name, angles in ANGLES.items():
         figure, panels = _grid_of_panels(8, 4)
         for axes, angle in zip(panels, angles, strict=True):
             kind = "between" if angle < TRAINING_ANGLES[-1] else "outside"
@@ -212,21 +189,18 @@ def _angle_nll_figure(fitted: Fitted) -> Figure:
 
 def _animate(model: FlowModel, path: Path, scale: Scale) -> None:
     """Turn the condition by a full circle; the title says whether the angle was trained."""
-    frames = []
-    for angle in np.linspace(0, 2 * np.pi, scale.frames, endpoint=False):
-        figure, (axes,) = _grid_of_panels(1, 1, size=2.4)
-        inside = angle <= TRAINING_ANGLES[-1]
-        state = "within the trained range" if inside else "never trained"
+    figure, (axes,) = _grid_of_panels(1, 1, size=2.4)
+
+    def draw(frame: int) -> None:
+        axes.clear()
+        axes.set(xticks=[], yticks=[])
+        angle = 2 * np.pi * frame / scale.frames
+        state = "within the trained range" if angle <= TRAINING_ANGLES[-1] else "never trained"
         _draw_angle(axes, model, angle, scale.pixels // 2, f"{angle:.1f} rad, {state}")
-        figure.set_dpi(90)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        image = Image.fromarray(np.asarray(canvas.buffer_rgba()))
-        frames.append(image.convert("RGB").quantize(48))
+
     with replacing(path) as draft:
-        frames[0].save(
-            draft, format="gif", save_all=True, append_images=frames[1:], duration=120, loop=0
-        )
+        animation = FuncAnimation(figure, draw, scale.frames, init_func=lambda: None, interval=120)
+        animation.save(draft, writer="pillow", dpi=90)
 
 
 def _grid_of_panels(n_panels: int, n_columns: int, size: float = 2.1) -> tuple[Figure, list[Axes]]:
@@ -255,19 +229,24 @@ def _draw_density(axes: Axes, density: np.ndarray, extent: float, title: str) ->
     The brightest percent of the pixels may saturate.
     """
     bright = np.quantile(density[density > density.max() * 1e-3], 0.99)
-    box = (-extent, extent, -extent, extent)
-    image = np.sqrt(np.minimum(density / bright, 1))
-    axes.imshow(image, origin="lower", extent=box, cmap="magma", vmin=0, vmax=1)
+    _draw_image(axes, np.sqrt(np.minimum(density / bright, 1)), extent, "magma")
     axes.set_title(title, fontsize=8)
+
+
+def _draw_image(
+    axes: Axes, image: np.ndarray, extent: float, colormap: str | LinearSegmentedColormap
+) -> None:
+    box = (-extent, extent, -extent, extent)
+    axes.imshow(image, origin="lower", extent=box, cmap=colormap, vmin=0, vmax=1)
 
 
 @th.no_grad()
 def density_picture(
-    model: FlowModel, condition: np.ndarray, extent: float, pixels: int
+    log_prob: LogProb, condition: np.ndarray, extent: float, pixels: int
 ) -> np.ndarray:
     """Evaluate p(. | condition) at the pixel centers of a square, from the lowest y and x up."""
     points = _pixel_centers(extent, pixels)
-    log_p = model(points, th.from_numpy(condition).float().expand(len(points), -1))
+    log_p = log_prob(points, th.from_numpy(condition).float().expand(len(points), -1))
     return log_p.exp().reshape(pixels, pixels).numpy()
 
 
@@ -289,11 +268,8 @@ def _sample(model: FlowModel, condition: np.ndarray) -> np.ndarray:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    """Write a PNG of 128 colors, about half the size of a full-color one."""
     with replacing(path) as draft:
-        figure.savefig(draft, dpi=110, format="png")
-        image = Image.open(draft).convert("RGB").quantize(128)
-        image.save(draft, format="png", optimize=True)
+        figure.savefig(draft, dpi=110, format="png", pil_kwargs={"optimize": True})
 
 
 # Study -> what draws its pictures.

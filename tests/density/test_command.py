@@ -71,21 +71,12 @@ def test_report_shows_every_study_and_check(
     assert "| **no** |" in text
 
 
-@pytest.mark.slow  # each process imports everything again
-def test_several_jobs_give_the_same_numbers(folder: Path, tmp_path: Path) -> None:
-    names = ["two-moons-label", "angle-moons"]
-    main(["run", *names, "--quick", "--jobs", "2", "--out", str(tmp_path)])
-    for name in names:
-        one, two = (pd.read_csv(path / f"{name}-fits.csv") for path in (folder, tmp_path))
-        assert one["nll"].tolist() == pytest.approx(two["nll"].tolist(), abs=1e-3)
-
-
 def test_list_names_every_study(capsys: pytest.CaptureFixture[str]) -> None:
     main(["list"])
     printed = capsys.readouterr().out
     for study in STUDIES.values():
         assert study.name in printed
-        assert study.rules in printed
+        assert study.thesis in printed
 
 
 @pytest.mark.parametrize(
@@ -94,7 +85,6 @@ def test_list_names_every_study(capsys: pytest.CaptureFixture[str]) -> None:
         ([], "list|run|report"),
         (["run", "three-moons"], "studies must be among .*two-moons.*, got .*three-moons"),
         (["run", "--seeds", "0"], "--seeds: value must be an integer of at least 1"),
-        (["run", "--jobs", "0"], "--jobs: value must be an integer of at least 1"),
         (["report", "--out", "nowhere"], "out must be a folder that `run` has written to"),
     ],
 )
@@ -139,18 +129,18 @@ def fit_row(model: str, nll: float, **changes: object) -> Row:
 )
 def test_soundness_catches_wrong_densities(change: Row, holds: list[bool]) -> None:
     rows = [fit_row("maf", 1.2), fit_row("maf", 1.2, **change)]
-    assert [one.holds for one in sound(pd.DataFrame(rows))] == holds
+    assert [held for *_, held in sound(pd.DataFrame(rows))] == holds
 
 
 def test_verdicts_follow_the_numbers() -> None:
     nll = {"realnvp": 1.1, "maf": 1.2, "maf-random": 1.12, "naf": 1.16, "zuko-realnvp": 1.12}
     rows = pd.DataFrame([fit_row(model, value) for model, value in nll.items()])
     nothing, curves = pd.DataFrame(), pd.DataFrame({"epoch": [250]})
-    assert [one.holds for one in two_moons(rows, curves, nothing)] == [True, False, False, True]
+    assert [holds for *_, holds in two_moons(rows, curves, nothing)] == [True, False, False, True]
     good = pd.DataFrame([fit_row("realnvp", 0.49)])
-    assert [one.holds for one in label(good, curves, nothing)] == [True, True]
+    assert [holds for *_, holds in label(good, curves, nothing)] == [True, True]
     bad = pd.DataFrame([fit_row("realnvp", 0.51, accuracy=0.98)])
-    assert [one.holds for one in label(bad, curves, nothing)] == [False, False]
+    assert [holds for *_, holds in label(bad, curves, nothing)] == [False, False]
 
 
 @pytest.mark.parametrize(("rise", "holds"), [(1.0, True), (-1.0, False)])
@@ -161,4 +151,4 @@ def test_angle_verdicts_follow_the_numbers(rise: float, holds: bool) -> None:
         for at in (2.1 + step, 6.2832 - step):
             rows.append({"seed": 0, "kind": "outside", "angle": at, "nll": rise * step})
     nothing = pd.DataFrame()
-    assert [one.holds for one in angle(nothing, nothing, pd.DataFrame(rows))] == [holds, holds]
+    assert [held for *_, held in angle(nothing, nothing, pd.DataFrame(rows))] == [holds, holds]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from sb3_flowpolicy.density.models import (
     MODELS,
     FlowModel,
     OurRealNVP,
-    ZukoNAF,
     make_model,
 )
 from sb3_flowpolicy.density.pictures import density_picture
@@ -66,8 +66,9 @@ def test_fits_improve(name: str) -> None:
     after = mean_nll(ensemble, validation)
     assert (after < before).all()
     # The weights with the best validation are kept.
-    th.testing.assert_close(after, curves.validation.min(0).values)
-    assert curves.epoch.tolist() == [2, 4, 6]
+    best = th.from_numpy(curves.groupby("seed")["other"].min().to_numpy()).float()
+    th.testing.assert_close(after, best)
+    assert curves["epoch"].tolist() == [2, 4, 6] * 3
 
 
 def test_seeds_are_independent() -> None:
@@ -101,14 +102,10 @@ def test_densities_integrate_to_one(name: str) -> None:
 
 
 def test_a_wrong_log_determinant_is_detected() -> None:
-    class Wrong(FlowModel):
-        def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-            return -0.5 * points.square().sum(-1) - math.log(2 * math.pi) + 0.1
+    def wrong(points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        return -0.5 * points.square().sum(-1) - math.log(2 * math.pi) + 0.1
 
-        def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-            return noise
-
-    assert integral(Wrong(), th.zeros(0), cells=100) == pytest.approx(math.exp(0.1), rel=1e-4)
+    assert integral(wrong, th.zeros(0), cells=100) == pytest.approx(math.exp(0.1), rel=1e-4)
 
 
 def test_naf_loses_mass_before_training() -> None:
@@ -119,8 +116,7 @@ def test_naf_loses_mass_before_training() -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_naf_does_not_squash_the_plane_from_the_start(seed: int) -> None:
     """zuko's own initial weights do, by five orders of magnitude."""
-    naf = make_model("naf", 0, seed)
-    assert isinstance(naf, ZukoNAF)
+    naf: Any = make_model("naf", 0, seed)
     untouched = type(naf.flow)(
         2, transforms=LAYERS, hidden_features=HIDDEN, network={"hidden_features": (16,)}
     )
@@ -161,15 +157,11 @@ def test_samples_follow_the_density(name: str) -> None:
 
 
 def test_density_picture_has_y_upwards() -> None:
-    class Shifted(FlowModel):
-        def forward(self, points: th.Tensor, condition: th.Tensor) -> th.Tensor:
-            centered = points - th.tensor([0.0, 1.0])
-            return -0.5 * centered.square().sum(-1) - math.log(2 * math.pi)
+    def shifted(points: th.Tensor, condition: th.Tensor) -> th.Tensor:
+        centered = points - th.tensor([0.0, 1.0])
+        return -0.5 * centered.square().sum(-1) - math.log(2 * math.pi)
 
-        def sample(self, noise: th.Tensor, condition: th.Tensor) -> th.Tensor:
-            return noise
-
-    image = density_picture(Shifted(), np.zeros(0), extent=2.0, pixels=4)
+    image = density_picture(shifted, np.zeros(0), extent=2.0, pixels=4)
     center = np.array([-1.5, -0.5, 0.5, 1.5])
     expected = np.exp(-0.5 * ((center[:, None] - 1) ** 2 + center**2)) / (2 * np.pi)
     np.testing.assert_allclose(image, expected, rtol=1e-5)
