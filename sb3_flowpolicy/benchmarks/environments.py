@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import gymnasium as gym
 
@@ -23,16 +24,19 @@ def benchmarks(quick: bool = False) -> list[Benchmark]:
     flowpolicy_envs.register_envs()
     candidates = []
     for env_id in (BASELINE, *(ENVIRONMENTS[:1] if quick else ENVIRONMENTS)):
-        vectorization = "sync" if env_id == BASELINE else "vector_entry_point"
-        batched = partial(_batch, env_id, vectorization)
-        candidates.append(Candidate(env_id, partial(_single, env_id)))
-        candidates.append(Candidate(f"{env_id}, batch of {BATCH}", batched))
+        candidates.append(Candidate(env_id, partial(_steps, env_id, 1)))
+        candidates.append(Candidate(f"{env_id}, batch of {BATCH}", partial(_steps, env_id, BATCH)))
     return [Benchmark("random actions", "steps", candidates)]
 
 
-def _single(env_id: str) -> Work:
-    """Step one environment, with a reset after each episode."""
-    env = gym.make(env_id, disable_env_checker=True)
+def _steps(env_id: str, n_envs: int) -> Work:
+    """Step one environment, or a batch that resets itself, and count the steps of each."""
+    env: Any
+    if n_envs == 1:
+        env = gym.make(env_id, disable_env_checker=True)
+    else:
+        mode = "sync" if env_id == BASELINE else "vector_entry_point"
+        env = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode=mode)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(N_CALLS)]
     env.reset(seed=0)
@@ -40,23 +44,8 @@ def _single(env_id: str) -> Work:
     def work() -> float:
         for action in actions:
             _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
+            if n_envs == 1 and (terminated or truncated):
                 env.reset()
-        return N_CALLS
-
-    return work
-
-
-def _batch(env_id: str, vectorization_mode: str) -> Work:
-    """Step a batch of environments that resets itself, and count the steps of each."""
-    env = gym.make_vec(env_id, num_envs=BATCH, vectorization_mode=vectorization_mode)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(N_CALLS)]
-    env.reset(seed=0)
-
-    def work() -> float:
-        for action in actions:
-            env.step(action)
-        return N_CALLS * BATCH
+        return N_CALLS * n_envs
 
     return work

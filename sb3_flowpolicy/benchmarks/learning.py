@@ -6,8 +6,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 
 import flowpolicy_envs
 from sb3_flowpolicy.algorithms.ppo_flow import PPOFlow
@@ -18,6 +19,7 @@ from sb3_flowpolicy.seeds.batch import SeedBatch
 
 ENV_ID = "TunnelDiagonal-v0"
 N_SEEDS = 10
+POLICIES = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
 # Steps per call of learn() and seed, enough to make the overhead of a call negligible.
 CHUNK = 500
 QUICK_START, QUICK_CHUNK = 50, 10
@@ -49,56 +51,79 @@ def stock_block(env_id: str) -> dict[str, Any]:
 def benchmarks(quick: bool = False) -> list[Benchmark]:
     """Return learning with SAC and PPO; ``quick`` neither compiles nor stacks seeds."""
     flowpolicy_envs.register_envs()
-    candidates = [Candidate("SB3 SAC", lambda: _steps(SAC, stock_block(ENV_ID), quick))]
+    candidates = [Candidate("SB3 SAC", partial(_sac, SAC, stock_block(ENV_ID), quick))]
     for algorithm in ("sac_gauss", "sac_flow"):
         block = zoo_block(algorithm, ENV_ID) | {"compile": not quick}
         name = algorithm + (", not compiled" if quick else "")
-        candidates.append(Candidate(name, partial(_steps, SACFlow, block, quick)))
+        candidates.append(Candidate(name, partial(_sac, SACFlow, block, quick)))
         if not quick:
-            stacked = partial(
-                _steps, partial(SeedBatch, seeds=range(N_SEEDS)), block, n_seeds=N_SEEDS
-            )
-            candidates.append(Candidate(f"SeedBatch of {N_SEEDS} {algorithm}", stacked))
+            stacked = partial(SeedBatch, seeds=range(N_SEEDS))
+            prepare = partial(_sac, stacked, block, n_seeds=N_SEEDS)
+            candidates.append(Candidate(f"SeedBatch of {N_SEEDS} {algorithm}", prepare))
+    ppo = partial(PPOFlow, compile=not quick)
     return [
         Benchmark(f"learn() on {ENV_ID}", "steps", candidates),
-        Benchmark(f"learn() of PPO on {PPO_ENV_ID}", "steps", _ppo_candidates(quick)),
+        Benchmark(
+            f"learn() of PPO on {PPO_ENV_ID}",
+            "steps",
+            [
+                Candidate("SB3 PPO", partial(_ppo, PPO, "MlpPolicy", quick)),
+                *(
+                    Candidate(f"PPOFlow {name}", partial(_ppo, ppo, name, quick))
+                    for name in POLICIES
+                ),
+            ],
+        ),
     ]
 
 
-def _ppo_candidates(quick: bool) -> list[Candidate]:
-    stock = Candidate("SB3 PPO", partial(_ppo_steps, PPO, "MlpPolicy", quick))
-    compiled = partial(PPOFlow, compile=not quick)
-    policies = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
-    ours = [Candidate(f"PPOFlow {p}", partial(_ppo_steps, compiled, p, quick)) for p in policies]
-    return [stock, *ours]
+def with_hindsight(quick: bool = False) -> list[Benchmark]:
+    """Return learning with hindsight experience replay; ``quick`` does not compile."""
+    start, chunk = (QUICK_START, QUICK_CHUNK) if quick else (1000, CHUNK)
+
+    def prepare(algorithm: Callable[..., Any], policy: str) -> Work:
+        model = algorithm(
+            policy,
+            BitFlippingEnv(n_bits=8, continuous=True),
+            batch_size=256,
+            learning_starts=start,
+            replay_buffer_class=HerReplayBuffer,
+            policy_kwargs={"net_arch": [64, 64]},
+        )
+        return _learning(model, start + chunk, chunk, chunk)
+
+    ours = partial(SACFlow, compile=not quick)
+    candidates = [
+        Candidate("SB3 SAC", partial(prepare, SAC, "MultiInputPolicy")),
+        *(Candidate(f"SACFlow {p}", partial(prepare, ours, f"MultiInput{p}")) for p in POLICIES),
+    ]
+    return [Benchmark("learn() with HER, nets 64-64", "steps", candidates)]
 
 
-def _ppo_steps(algorithm: Callable[..., Any], policy: str, quick: bool) -> Work:
-    """Collect a rollout and learn from it per piece of work."""
-    n_steps = QUICK_CHUNK if quick else N_STEPS
-    env = make_vec_env(PPO_ENV_ID, N_ENVS)
-    model = algorithm(policy, env, n_steps=n_steps, **PPO_SETTINGS).learn(1)
-
-    def work() -> float:
-        model.learn(1, reset_num_timesteps=False)
-        return n_steps * N_ENVS
-
-    return work
-
-
-def _steps(
-    algorithm: Callable[..., Any], block: dict[str, Any], quick: bool = False, n_seeds: int = 1
-) -> Work:
-    """Learn in chunks after random steps and compilation, and count the steps of all seeds."""
-    kwargs = dict(block)
-    if quick:
-        kwargs |= {key: QUICK_START for key in ("learning_starts", "random_steps") if key in kwargs}
-    model = algorithm(env=ENV_ID, **kwargs)
-    chunk = QUICK_CHUNK if quick else CHUNK
-    model.learn(max(kwargs["learning_starts"], kwargs.get("random_steps", 0)) + chunk)
+def _learning(model: Any, warm_up: int, chunk: int, amount: int) -> Work:
+    """Learn in chunks after a warm-up: random steps and compilation."""
+    model.learn(warm_up)
 
     def work() -> float:
         model.learn(chunk, reset_num_timesteps=False)
-        return chunk * n_seeds
+        return amount
 
     return work
+
+
+def _sac(
+    algorithm: Callable[..., Any], block: dict[str, Any], quick: bool = False, n_seeds: int = 1
+) -> Work:
+    starts = {name for name in ("learning_starts", "random_steps") if name in block}
+    kwargs = block | (dict.fromkeys(starts, QUICK_START) if quick else {})
+    chunk = QUICK_CHUNK if quick else CHUNK
+    warm_up = max(kwargs[name] for name in starts) + chunk
+    return _learning(algorithm(env=ENV_ID, **kwargs), warm_up, chunk, chunk * n_seeds)
+
+
+def _ppo(algorithm: Callable[..., Any], policy: str, quick: bool) -> Work:
+    """Collect a rollout and learn from it per piece of work."""
+    n_steps = QUICK_CHUNK if quick else N_STEPS
+    env = make_vec_env(PPO_ENV_ID, N_ENVS)
+    model = algorithm(policy, env, n_steps=n_steps, **PPO_SETTINGS)
+    return _learning(model, 1, 1, n_steps * N_ENVS)

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import argparse
 import os
+import pkgutil
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 
 import torch as th
 
-from sb3_flowpolicy.benchmarks.report import SCHEMA, Row, rows, table
-from sb3_flowpolicy.benchmarks.timing import measure
+from sb3_flowpolicy.benchmarks.timing import Row, measure, table
 from sb3_flowpolicy.common.command_line import check_folder_of
 from sb3_flowpolicy.common.files import write_json
 from sb3_flowpolicy.common.machine import machine
 
-# Group -> module with its benchmarks, in the order in which they run: zuko, which changes torch
+# Group -> what returns its benchmarks, in the order in which they run: zuko, which changes torch
 # for the whole process when imported, comes last.
 GROUPS = {
-    "updates": "updates",
-    "contrib": "contrib",
-    "learn": "learning",
-    "her": "her",
-    "environments": "environments",
-    "trust": "trust",
-    "flow": "flows",
+    "updates": "updates:benchmarks",
+    "contrib": "updates:contrib",
+    "learn": "learning:benchmarks",
+    "her": "learning:with_hindsight",
+    "environments": "environments:benchmarks",
+    "trust": "trust:benchmarks",
+    "flow": "flows:benchmarks",
 }
+# Increase it when a field of the JSON file changes its meaning.
+SCHEMA = 1
 
 _DESCRIPTION = """\
 Measure the speed of sb3_flowpolicy and of its baselines on this machine.
@@ -84,9 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     found: list[Row] = []
     for group in (name for name in GROUPS if name in (args.only or GROUPS)):
-        module = import_module(f"sb3_flowpolicy.benchmarks.{GROUPS[group]}")
-        for benchmark in module.benchmarks(args.quick):
-            new = rows(group, benchmark, measure(benchmark, rounds, turn_seconds))
+        benchmarks = pkgutil.resolve_name(f"sb3_flowpolicy.benchmarks.{GROUPS[group]}")
+        for benchmark in benchmarks(args.quick):
+            new = measure(group, benchmark, rounds, turn_seconds)
             found += new
             print(table(new), end="\n\n", flush=True)
             if args.json is not None:  # after each benchmark: an interrupted run keeps its results

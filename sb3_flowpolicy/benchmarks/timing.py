@@ -6,100 +6,125 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import pandas as pd
 
 # Does a piece of work and returns its amount in the benchmark's unit (updates, steps, ...).
 Work = Callable[[], float]
+# One line of the table and one object under "rows" in the JSON file.
+Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """Something whose rate is measured.
-
-    Args:
-        name: Label in the table.
-        prepare: Builds everything and returns the work to be timed. Preparation and the first
-            piece of work are the warm-up: compile and fill buffers there. If it needs a package
-            that is not installed, the table says so.
-        limit: Name of the candidate of the same benchmark that does the unavoidable work only.
-    """
+class Candidate(NamedTuple):
+    """Something whose rate is measured."""
 
     name: str
+    # Builds everything and returns the work to be timed. Preparation and the first piece of work
+    # are the warm-up: compile and fill buffers there.
     prepare: Callable[[], Work]
+    # Name of the candidate of the same benchmark that does the unavoidable work only.
     limit: str | None = None
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """Candidates that do the same work; the first one is the baseline for all."""
+class Benchmark(NamedTuple):
+    """Candidates that do the same work; the first one is the baseline ("peer") for all."""
 
     title: str
     unit: str
     candidates: Sequence[Candidate]
 
 
-@dataclass
-class Timing:
-    """Work per second in each round, without the warm-up; a note if the candidate cannot run."""
-
-    warm_up_seconds: float | None = None
-    rates: list[float] = field(default_factory=list)
-    note: str | None = None
-
-    @property
-    def median(self) -> float | None:
-        """Median rate, None without measurements."""
-        return statistics.median(self.rates) if self.rates else None
-
-    def ratio_to(self, other: Timing) -> float | None:
-        """Median over rounds of this rate over the other's, measured under the same load."""
-        if not self.rates or not other.rates:
-            return None
-        return statistics.median(a / b for a, b in zip(self.rates, other.rates, strict=True))
-
-
 def measure(
+    group: str,
     benchmark: Benchmark,
     rounds: int = 5,
     turn_seconds: float = 0.5,
     clock: Callable[[], float] = time.perf_counter,
-) -> list[Timing]:
+) -> list[Row]:
     """Prepare all candidates, then run them in turns (A B C, A B C, ...).
 
     Args:
+        group: Name of the group, for the rows.
         benchmark: Candidates to measure.
         rounds: Turns per candidate.
         turn_seconds: A turn repeats its work until this much time has passed.
         clock: Returns seconds.
 
     Returns:
-        One timing per candidate, in order.
+        One row per candidate. ``rates`` is the work per second in each round and ``rate`` their
+        median, None if the candidate needs a package that is not installed, which ``note`` then
+        names. ``ratio`` and ``limit_fraction`` are medians of the ratios within rounds.
 
     Example:
         >>> counting = Candidate("counting", lambda: lambda: sum(range(9)))
-        >>> (timing,) = measure(Benchmark("counting", "numbers", [counting]), turn_seconds=0.001)
-        >>> len(timing.rates)
+        >>> (row,) = measure("", Benchmark("counting", "numbers", [counting]), turn_seconds=0.001)
+        >>> len(row["rates"])
         5
     """
-    timings, ready = [], []
-    for candidate in benchmark.candidates:
-        print(f"{benchmark.title}: warm-up of {candidate.name}", file=sys.stderr)
-        timing, start = Timing(), clock()
-        timings.append(timing)
+    works: dict[str, Work] = {}
+    warm_up: dict[str, float] = {}
+    notes: dict[str, str] = {}
+    for name, prepare, _ in benchmark.candidates:
+        print(f"{benchmark.title}: warm-up of {name}", file=sys.stderr)
+        start = clock()
         try:
-            work = candidate.prepare()
+            work = prepare()
             work()
         except ModuleNotFoundError as reason:
-            timing.note = str(reason)
+            notes[name] = str(reason)
         else:
-            timing.warm_up_seconds = clock() - start
-            ready.append((timing, work))
+            works[name], warm_up[name] = work, clock() - start
+    rates: dict[str, list[float]] = {one.name: [] for one in benchmark.candidates}
     for done in range(rounds):
         print(f"{benchmark.title}: round {done + 1} of {rounds}", file=sys.stderr)
-        for timing, work in ready:
+        for name, work in works.items():
             amount, elapsed, start = 0.0, 0.0, clock()
             while elapsed < turn_seconds:
                 amount += work()
                 elapsed = clock() - start
-            timing.rates.append(amount / elapsed)
-    return timings
+            rates[name].append(amount / elapsed)
+
+    def ratio(name: str, other: str | None) -> float | None:
+        if other is None or not rates[name] or not rates[other]:
+            return None
+        return statistics.median(a / b for a, b in zip(rates[name], rates[other], strict=True))
+
+    peer = benchmark.candidates[0].name
+    return [
+        {
+            "group": group,
+            "contest": benchmark.title,
+            "name": name,
+            "unit": benchmark.unit,
+            "rate": statistics.median(rates[name]) if rates[name] else None,
+            "rates": rates[name],
+            "peer": peer,
+            "ratio": ratio(name, peer),
+            "limit": limit,
+            "limit_fraction": ratio(name, limit),
+            "warm_up_seconds": warm_up.get(name),
+            "note": notes.get(name),
+        }
+        for name, _, limit in benchmark.candidates
+    ]
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Lay out the rows of one benchmark as text."""
+    text = "{group}: {contest}, {unit} per second".format(**rows[0])
+    cells = {
+        row["name"]: {
+            "per second": f"{row['rate']:,.0f}",
+            "lowest-highest": f"{min(row['rates']):,.0f}-{max(row['rates']):,.0f}",
+            "x baseline": "-" if row["ratio"] is None else f"{row['ratio']:.2f}",
+            "of limit": "-" if row["limit_fraction"] is None else f"{row['limit_fraction']:.0%}",
+            "warm-up": f"{row['warm_up_seconds']:.1f} s",
+        }
+        for row in rows
+        if row["rate"] is not None
+    }
+    if cells:
+        text += "\n" + pd.DataFrame(cells).T.to_string()
+    notes = [f"\n{row['name']}: {row['note']}" for row in rows if row["rate"] is None]
+    return text + "".join(notes)

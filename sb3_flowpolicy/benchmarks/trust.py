@@ -17,7 +17,7 @@ from unittest import mock
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.algorithms import off_policy
+from sb3_flowpolicy.algorithms import engine_flow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, zoo_block
 from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
@@ -30,10 +30,9 @@ from sb3_flowpolicy.seeds.batch import SeedBatch
 # Steps whose calls are timed.
 CHUNK = 1000
 OBS_DIM, ACTION_DIM = 42, 8
-BATCH_SIZES = (1, 100)
 # All that the guard does during training.
 _CALLS = (
-    (off_policy, "check_step"),
+    (engine_flow, "check_step"),
     (experience, "check_experience"),
     (TrainingGuard, "before_updates"),
     (TrainingGuard, "after_updates"),
@@ -44,14 +43,10 @@ _CALLS = (
 def benchmarks(quick: bool = False) -> list[Benchmark]:
     """Return ``predict`` in each mode for one observation and for many."""
     title = f"predict, nets 256-256, obs {OBS_DIM}, D = {ACTION_DIM}"
-    return [
-        Benchmark(
-            f"{title}, {size} at once",
-            "calls",
-            [Candidate(mode, partial(_acting, mode, size)) for mode in MODES],
-        )
-        for size in BATCH_SIZES
-    ]
+    sizes = {
+        size: [Candidate(mode, partial(_acting, mode, size)) for mode in MODES] for size in (1, 100)
+    }
+    return [Benchmark(f"{title}, {n} at once", "calls", each) for n, each in sizes.items()]
 
 
 def _acting(mode: str, size: int) -> Work:

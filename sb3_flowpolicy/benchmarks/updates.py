@@ -1,7 +1,8 @@
-"""Gradient updates per second: SACFlow against SB3's SAC and against the matrix products alone."""
+"""Gradient updates per second: ours against stock's and against the matrix products alone."""
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -18,9 +19,9 @@ from torch import nn
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, stock_block, zoo_block
+from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, POLICIES, stock_block, zoo_block
 from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
-from sb3_flowpolicy.engine import EngineRuntime, build_engine, why_unsupported
+from sb3_flowpolicy.engine import Engine, EngineRuntime
 from sb3_flowpolicy.policies import FlowPolicy
 from sb3_flowpolicy.seeds.setup import refuse
 
@@ -45,21 +46,18 @@ class Shape(NamedTuple):
         """Title of the benchmark."""
         return f"nets {self.units}-{self.units}, obs {self.obs_dim}, D = {self.action_dim}"
 
-    def policy_kwargs(self, policy: str) -> dict[str, Any]:
+    def policy_kwargs(self, policy: Any) -> dict[str, Any]:
         """Return the sizes of the networks of a policy."""
-        units = [self.units, self.units]
-        if policy == "FlowPolicy" and self.units == 16:
+        units, small = [self.units, self.units], [4, 4]
+        if policy in ("FlowPolicy", FlowPolicy) and self.units == 16:
             # Thesis section 3.2.4: about as many parameters as the Gaussian's.
-            small = [4, 4]
-            return {
-                "net_arch": {"pi": small, "qf": units},
-                "distribution_kwargs": {"hidden": small},
-            }
+            sizes = {"pi": small, "qf": units}
+            return {"net_arch": sizes, "distribution_kwargs": {"hidden": small}}
         return {"net_arch": units}
 
 
 SHAPES = (Shape(16, 2, 2), Shape(128, 2, 2), Shape(256, 42, 8))
-POLICIES = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
+CONTRIB_SHAPES = (Shape(64, 17, 6), Shape(256, 42, 8))
 
 
 class Unmoved(gym.Env):
@@ -77,30 +75,54 @@ def benchmarks(quick: bool = False) -> list[Benchmark]:
     return [*(_single_seed(shape, POLICIES) for shape in SHAPES), _stacked_seeds()]
 
 
-def _single_seed(shape: Shape, policies: Sequence[str]) -> Benchmark:
-    def model(algorithm: Callable[..., Any], policy: Any, sizes_of: str, **kwargs: Any) -> Any:
-        sizes = shape.policy_kwargs(sizes_of)
-        return prefilled(algorithm, shape, policy=policy, policy_kwargs=sizes, **kwargs)
+def contrib(quick: bool = False) -> list[Benchmark]:
+    """Return TQC and CrossQ against sb3-contrib's; ``quick``: one shape, not compiled."""
 
+    def candidate(shape: Shape, algorithm: str, policy: str, **kwargs: Any) -> Candidate:
+        def prepare() -> Work:
+            constructor = pkgutil.resolve_name(algorithm)  # needs the extra [contrib]
+            # sb3-contrib's updates take long.
+            return updates_of(_sized(constructor, shape, policy, **kwargs), n_calls=1)
+
+        return Candidate(f"{algorithm.rpartition(':')[2]} {policy}", prepare)
+
+    return [
+        Benchmark(
+            f"{name}, {shape.title}",
+            "updates",
+            [
+                candidate(shape, f"sb3_contrib:{name}", "MlpPolicy"),
+                *(
+                    candidate(shape, f"sb3_flowpolicy:{name}Flow", policy, compile=not quick)
+                    for policy in POLICIES
+                ),
+            ],
+        )
+        for name in ("TQC", "CrossQ")
+        for shape in CONTRIB_SHAPES[: 1 if quick else None]
+    ]
+
+
+def _single_seed(shape: Shape, policies: Sequence[str]) -> Benchmark:
     def updates(*args: Any, **kwargs: Any) -> Callable[[], Work]:
-        return lambda: updates_of(model(*args, **kwargs))
+        return lambda: updates_of(_sized(*args, **kwargs))
 
     def sbx() -> Work:
-        return updates_of(model(import_module("sbx").SAC, "MlpPolicy", "MlpPolicy"))
+        return updates_of(_sized(import_module("sbx").SAC, shape, "MlpPolicy"))
 
     def limit(policy: str) -> Work:
-        return products_alone([model(SACFlow, policy, policy).policy], BATCH_SIZE, N_UPDATES)
+        return products_alone([_sized(SACFlow, shape, policy).policy], BATCH_SIZE, N_UPDATES)
 
-    stock = updates(SAC, "MlpPolicy", "MlpPolicy")
+    stock = updates(SAC, shape, "MlpPolicy")
     candidates = [Candidate("SB3 SAC", stock, _limit_name("GaussPolicy"))]
     for policy in policies:
-        ours = updates(SACFlow, policy, policy, compile=True)
+        ours = updates(SACFlow, shape, policy, compile=True)
         candidates.append(Candidate(f"SACFlow {policy}", ours, _limit_name(policy)))
         if shape.units >= MIN_UNITS_BFLOAT16 and policy != "LowRankPolicy":
-            rounded = updates(SACFlow, policy, policy, compile=True, autocast=True)
+            rounded = updates(SACFlow, shape, policy, compile=True, autocast=True)
             candidates.append(Candidate(f"SACFlow {policy}, bfloat16", rounded))
     if "FlowPolicy" in policies:
-        ours = updates(SAC, FlowPolicy, "FlowPolicy")
+        ours = updates(SAC, shape, FlowPolicy)
         candidates.append(Candidate("SB3 SAC with FlowPolicy", ours, _limit_name("FlowPolicy")))
     candidates.append(Candidate("SBX SAC", sbx))
     candidates += [Candidate(_limit_name(policy), partial(limit, policy)) for policy in policies]
@@ -116,8 +138,7 @@ def _stacked_seeds() -> Benchmark:
         return updates_of(prefilled(SAC, SHAPES[0], **stock_block(ENV_ID)))
 
     def stacked(algorithm: str) -> Work:
-        seeds = models(algorithm)
-        runtime = EngineRuntime(seeds, why_unsupported, build_engine, refuse)
+        runtime = EngineRuntime(models(algorithm), Engine, refuse)
 
         def work() -> float:
             with runtime.running():
@@ -144,6 +165,12 @@ def _stacked_seeds() -> Benchmark:
 
 def _limit_name(of: str) -> str:
     return f"products alone, {of}"
+
+
+def _sized(algorithm: Callable[..., Any], shape: Shape, policy: Any, **kwargs: Any) -> Any:
+    """Return a prefilled model whose networks have the sizes of the shape."""
+    sizes = shape.policy_kwargs(policy)
+    return prefilled(algorithm, shape, policy=policy, policy_kwargs=sizes, **kwargs)
 
 
 def prefilled(algorithm: Callable[..., Any], shape: Shape, **kwargs: Any) -> Any:

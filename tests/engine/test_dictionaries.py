@@ -17,8 +17,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.benchmarks.her import make_reach
-from sb3_flowpolicy.engine import Engine, why_unsupported
+from sb3_flowpolicy.engine import Engine
 from sb3_flowpolicy.engine.observations import Observations, why_space_unsupported
 from tests.engine.test_equality import (
     OURS,
@@ -26,6 +25,7 @@ from tests.engine.test_equality import (
     seed_everything,
     stock_loop,
 )
+from tests.reach import make_reach
 
 FAST: dict[str, Any] = {"learning_starts": 200, "buffer_size": 300, "seed": 0, "device": "cpu"}
 
@@ -145,4 +145,4 @@ def test_what_is_left_to_sb3() -> None:
     assert why_space_unsupported(spaces["position"]) is None
     env = make_reach()
     model = SACFlow("MultiInputFlowPolicy", env, device="cpu", policy_kwargs={"net_arch": [8]})
-    assert why_unsupported(model) is None
+    assert Engine.why_unsupported(model) is None

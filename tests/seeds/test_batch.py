@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
-from sb3_flowpolicy.benchmarks.her import make_reach
+from tests.reach import make_reach
 
 FAST: dict[str, Any] = {
     "learning_starts": 30,

@@ -1,22 +1,13 @@
-"""Environment steps per second of ``learn()`` with hindsight experience replay."""
+"""A small environment with goals, for hindsight experience replay."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import SAC, HerReplayBuffer
-
-from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.benchmarks.learning import CHUNK, QUICK_CHUNK, QUICK_START
-from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
-from sb3_flowpolicy.benchmarks.updates import BATCH_SIZE, POLICIES
 
 N_STEPS, SPEED, TOLERANCE = 25, 0.2, 0.1
-LEARNING_STARTS = 1000
 
 
 class Reach(gym.Env):
@@ -57,34 +48,3 @@ class Reach(gym.Env):
 def make_reach() -> gym.Env:
     """Return a Reach environment with episodes of 25 steps."""
     return gym.wrappers.TimeLimit(Reach(), N_STEPS)
-
-
-def benchmarks(quick: bool = False) -> list[Benchmark]:
-    """Return learning with networks of 64-64; ``quick`` does not compile."""
-    stock = Candidate("SB3 SAC", partial(_steps, SAC, "MultiInputPolicy", quick))
-    ours = [
-        Candidate(
-            f"SACFlow {policy}",
-            partial(_steps, partial(SACFlow, compile=not quick), f"MultiInput{policy}", quick),
-        )
-        for policy in POLICIES
-    ]
-    return [Benchmark("learn() with HER, nets 64-64", "steps", [stock, *ours])]
-
-
-def _steps(algorithm: Callable[..., Any], policy: str, quick: bool) -> Work:
-    start, chunk = (QUICK_START, QUICK_CHUNK) if quick else (LEARNING_STARTS, CHUNK)
-    model = algorithm(
-        policy,
-        make_reach(),
-        batch_size=BATCH_SIZE,
-        learning_starts=start,
-        replay_buffer_class=HerReplayBuffer,
-        policy_kwargs={"net_arch": [64, 64]},
-    ).learn(start + chunk)
-
-    def work() -> float:
-        model.learn(chunk, reset_num_timesteps=False)
-        return chunk
-
-    return work
