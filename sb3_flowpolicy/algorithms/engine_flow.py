@@ -1,35 +1,73 @@
-"""What the off-policy algorithms that run on the engine share."""
+"""What SACFlow, TQCFlow and CrossQFlow share."""
 
 from __future__ import annotations
 
 import warnings
-from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, TypeVar
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import MaybeCallback, TrainFreq
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
-from sb3_flowpolicy.common.validation import check_settings, either, flag
-from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, build_engine, why_unsupported
+from sb3_flowpolicy.algorithms import exploration
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration
+from sb3_flowpolicy.checkpoint.segments import Ring
+from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
+from sb3_flowpolicy.checkpoint.state import Run
+from sb3_flowpolicy.common.validation import (
+    Check,
+    by_name,
+    check_policy,
+    check_settings,
+    either,
+    entropy_coefficient,
+    flag,
+    integer,
+    number,
+    optional,
+    train_frequency,
+)
+from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
+from sb3_flowpolicy.engine.replay import COLUMNS, is_plain
 from sb3_flowpolicy.engine.update import Objective
-from sb3_flowpolicy.guard.finite import check_observation
+from sb3_flowpolicy.guard import NonFiniteError, TrainingGuard
+from sb3_flowpolicy.guard.finite import (
+    ENVIRONMENT,
+    check_experience,
+    check_observation,
+    check_step,
+)
+from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.policies.base import check_finite
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+# Minibatches are drawn for many updates at once, but not for all of an offline run.
 MOST_DRAWN_AT_ONCE = 1000
 
-SelfEngineFlow = TypeVar("SelfEngineFlow", bound="EngineFlow")
+# The critics come first: losses of the stock loop are means over several updates, which do not tell
+# which loss was the first to fail.
+_STOCK_LOSSES = ("critic_loss", "ent_coef", "ent_coef_loss", "actor_loss")
 
 
-class EngineFlow(OffPolicyFlow):
-    """Mixin for off-policy algorithms whose updates and acting are compiled.
+class EngineFlow(OffPolicyAlgorithm):
+    """Mixin for SB3's off-policy algorithms, to be named before them.
 
-    An algorithm says by :meth:`objective` what it does with its critics. While it learns, an
-    :class:`~sb3_flowpolicy.engine.EngineRuntime` binds it to the engine.
+    An algorithm has a :class:`~sb3_flowpolicy.guard.TrainingGuard`, which rejects what is not
+    finite; :class:`~sb3_flowpolicy.checkpoint.RunCheckpoints` to resume from; a
+    :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`; and an
+    :class:`~sb3_flowpolicy.engine.EngineRuntime`, which binds it to the compiled engine while it
+    learns. This class passes them what happens in SB3's training loop.
 
     Args:
         *args: Arguments of the algorithm.
@@ -39,13 +77,46 @@ class EngineFlow(OffPolicyFlow):
         autocast: Whether matrix products run in bfloat16 (``torch.autocast``). On processors that
             support it, networks of 128 units or more train 1.2 to 1.6 times as fast, small ones
             slower. Parameters, optimizer states and replay stay float32; products keep 8 bits.
-        **kwargs: Keyword arguments of the algorithm and of :class:`OffPolicyFlow`.
+        action_noise_color: Exponent of the spectrum of the exploration noise, in [0, 1.5]: 0 is
+            white, 1 pink.
+        action_noise_correlation_time: Instead of a color, the steps after which the
+            autocorrelation of an Ornstein-Uhlenbeck process has fallen to 1/e, above 0.
+        **kwargs: Keyword arguments of the algorithm.
 
     Raises:
-        ValueError: If an argument is out of range.
+        ValueError: If an argument is out of range, or the policy belongs to another algorithm.
     """
 
-    settings: ClassVar = {**SETTINGS, "compile": either("auto", flag), "autocast": flag}
+    actor: Any
+    critic: Any
+    ent_coef_optimizer: th.optim.Adam | None
+    stock: ClassVar[type[OffPolicyAlgorithm]]
+    """The algorithm of SB3 or sb3-contrib that this one extends."""
+    policy_class_of_stock: ClassVar[type[BasePolicy]]
+    """Base class of its policies."""
+    settings: ClassVar[Mapping[str, Check]] = {
+        "buffer_size": integer(1),
+        "learning_starts": number(0),
+        "batch_size": integer(1),
+        "tau": number(0, 1),
+        "gamma": number(0, 1),
+        "train_freq": train_frequency,
+        "gradient_steps": integer(-1),
+        "optimize_memory_usage": flag,
+        "n_steps": integer(1),
+        "ent_coef": entropy_coefficient,
+        "target_update_interval": integer(1),
+        "target_entropy": either("auto", number()),
+        "use_sde": flag,
+        "sde_sample_freq": integer(-1),
+        "use_sde_at_warmup": flag,
+        "stats_window_size": integer(1),
+        "seed": optional(integer(0, 2**32 - 1)),
+        "compile": either("auto", flag),
+        "autocast": flag,
+        **exploration.SETTINGS,
+    }
+    """Arguments of the constructor that are plain values, with their checks."""
     random_steps: int | None = None
     """Environment steps with random actions at the start; None stands for ``learning_starts``."""
 
@@ -54,28 +125,104 @@ class EngineFlow(OffPolicyFlow):
         *args: Any,
         compile: bool | Literal["auto"] = "auto",
         autocast: bool = False,
+        action_noise_color: float = 0.0,
+        action_noise_correlation_time: float | None = None,
         **kwargs: Any,
     ) -> None:
-        check_settings({"compile": compile, "autocast": autocast}, self.settings)
+        given = by_name(self.stock, args, kwargs)
+        check_settings({**given, "compile": compile, "autocast": autocast}, self.settings)
+        check_policy(given.get("policy"), self.policy_class_of_stock, self.policy_aliases)
         self.compile: bool | Literal["auto"] = compile
         self.autocast = autocast
-        self._runtime = EngineRuntime([self], why_unsupported, build_engine, warn_of_stock_loop)
+        self.action_noise_color = action_noise_color
+        self.action_noise_correlation_time = action_noise_correlation_time
+        self._runtime = EngineRuntime([self], Engine, warn_of_stock_loop)
+        self._exploration = ColoredExploration()
+        self._guard = TrainingGuard([self])
+        self._checkpoints = RunCheckpoints(self._describe_run)
         super().__init__(*args, **kwargs)
 
-    @abstractmethod
-    def objective(self) -> Objective:
-        """Return what the algorithm makes of its critics' outputs, from its present settings."""
+    def objective(self) -> Objective | None:
+        """Return what the algorithm makes of its critics' outputs, from its present settings.
+
+        None stands for an algorithm whose updates the engine does not know.
+        """
+        return None
+
+    @classmethod
+    def resume(cls, path: str | Path, env: GymEnv | str, device: th.device | str = "auto") -> Self:
+        """Resume a run from its newest undamaged checkpoint.
+
+        Repeat the interrupted call of :meth:`learn` with the same arguments: it goes on to the same
+        end, and all numbers are those of a run that was not interrupted. Checkpoints contain
+        pickles: resume only those that you trust.
+
+        Args:
+            path: Folder of checkpoints.
+            env: A new environment, built and wrapped as the run's own, or its id. It takes over the
+                state of that one, the running episode included, and its ``Monitor`` file.
+            device: Where to put the networks.
+
+        Returns:
+            The model.
+
+        Raises:
+            ValueError: If the folder holds no undamaged checkpoint, or one of another algorithm, or
+                the environment does not fit.
+        """
+        store, checkpoint = open_checkpoint(path, cls.__name__)
+        venv = cls._wrap_env(maybe_make_env(env, 0))
+        model = load_agent(cls, checkpoint, "model", venv, device)
+        model._checkpoints.load(store, checkpoint)
+        return model
 
     def learn(
-        self: SelfEngineFlow,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        *args: Any,
-        **kwargs: Any,
-    ) -> SelfEngineFlow:
-        """Train; the arguments are those of :meth:`OffPolicyFlow.learn`."""
-        with self._runtime.running(watched=callback is not None):
-            return super().learn(total_timesteps, callback, *args, **kwargs)
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        checkpoint_every: int | None = None,
+        checkpoint_path: str | Path | None = None,
+    ) -> Self:
+        """Train as in SB3, and optionally write checkpoints to resume from.
+
+        Args:
+            total_timesteps: As in SB3, as are the following.
+            callback: Called at every step.
+            log_interval: Episodes between two dumps of the log.
+            tb_log_name: Name of the TensorBoard run. Default: the stock algorithm's, as in SB3.
+            reset_num_timesteps: Whether to count from zero.
+            progress_bar: Whether to show one.
+            checkpoint_every: Environment steps between two checkpoints for :meth:`resume`. Ctrl-C
+                and SIGTERM then write one, too, before they stop the program. Default: none.
+            checkpoint_path: Folder for them, empty for a new run.
+
+        Returns:
+            The model.
+
+        Raises:
+            ValueError: If only one of the last two is given, or the folder holds checkpoints of
+                another run.
+            NonFiniteError: If the environment returns, or training produces, NaN or infinity.
+        """
+        number(0)("total_timesteps", total_timesteps)
+        with (
+            self._runtime.running(watched=callback is not None),
+            self._checkpoints.learning(checkpoint_path, checkpoint_every),
+        ):
+            super().learn(
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name or self.stock.__name__,
+                reset_num_timesteps,
+                progress_bar,
+            )
+            self._guard.look()
+        return self
 
     def predict(
         self,
@@ -95,47 +242,13 @@ class EngineFlow(OffPolicyFlow):
             if engine is not None and engine.compiled:
                 obs, is_batch = self.policy.obs_to_tensor(observation)
                 check_observation(observation)
-                rows = engine.networks.observations.pack(obs)
-                scaled = self._act_compiled(engine, rows, deterministic)
+                scaled = engine.act_if_compiled(obs, deterministic)
                 if scaled is not None:
                     check_finite(scaled)
+                    scaled = scaled.reshape(-1, *(self.action_space.shape or ()))
                     actions = self.policy.unscale_action(scaled)
                     return (actions if is_batch else actions.squeeze(axis=0)), state
         return super().predict(observation, state, episode_start, deterministic)
-
-    def _act_compiled(
-        self, engine: Engine, obs: th.Tensor, deterministic: bool
-    ) -> np.ndarray | None:
-        """Return scaled actions, None if there is no compiled function for them."""
-        obs = obs.unsqueeze(0).contiguous()
-        if not engine.has_compiled_policy(obs):
-            return None
-        noise = None
-        if deterministic:  # the mode is the image of no noise
-            actor, shape = engine.networks.actor.data, (*obs.shape[:2], engine.networks.noise_dim)
-            noise = actor.new_zeros(shape)
-        return engine.act(obs, noise).cpu().numpy().reshape(-1, *(self.action_space.shape or ()))
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        self._runtime.plan(self._n_updates, self._planned_updates(total_timesteps))
-        return total_timesteps, callback
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        random_steps = learning_starts if self.random_steps is None else self.random_steps
-        engine = None
-        if self.num_timesteps >= random_steps and self._runtime.is_running:
-            engine = self._runtime.engine()
-        if engine is None or not engine.compiled:
-            return super()._sample_action(random_steps, action_noise, n_envs)
-        obs = engine.networks.observations.pack(self._last_obs, self.device)
-        noise = self._exploration.next()
-        if noise is not None:
-            noise = noise.to(engine.networks.actor.data).unsqueeze(0)
-        scaled = engine.act(obs.unsqueeze(0), noise).squeeze(0).cpu().numpy()
-        return self._finish_action(scaled, action_noise, n_envs)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Do ``gradient_steps`` updates with minibatches of ``batch_size`` transitions.
@@ -147,12 +260,14 @@ class EngineFlow(OffPolicyFlow):
             NonFiniteError: If a loss is not finite; weights are then as they were when the guard
                 last checked them.
         """
+        if gradient_steps == 0:  # SB3 would log NaN, the mean of an empty list
+            return
         with self._runtime.running():
             engine = self._runtime.engine()
             if engine is None:
-                return self._train_with_sb3(gradient_steps, batch_size)
+                self._train_with_sb3(gradient_steps, batch_size)
+                return
             self._update_learning_rate(list(self.optimizers().values()))
-            # Minibatches are drawn for many updates at once, but not for all of an offline run.
             for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
                 n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
                 self._guard.before_updates()
@@ -164,7 +279,16 @@ class EngineFlow(OffPolicyFlow):
 
     def _train_with_sb3(self, gradient_steps: int, batch_size: int) -> None:
         """Run the stock algorithm's loop."""
+        self._guard.before_updates()
         super().train(gradient_steps, batch_size)
+        logged = self.logger.name_to_value
+        losses = {f"train/{name}": logged.get(f"train/{name}", 0.0) for name in _STOCK_LOSSES}
+        try:
+            self._guard.after_updates(_STOCK_LOSSES, [[loss] for loss in losses.values()])
+        except NonFiniteError:
+            for name in losses:  # or the next updates would be blamed for them
+                logged.pop(name, None)
+            raise
 
     def record_losses(
         self,
@@ -178,6 +302,38 @@ class EngineFlow(OffPolicyFlow):
             if key in names and (key != "ent_coef_loss" or self.ent_coef_optimizer is not None):
                 self.logger.record(f"train/{key}", values[seed])
 
+    def optimizers(self) -> dict[str, th.optim.Optimizer]:
+        """Return the optimizers by name; the entropy coefficient has one only if it is learned."""
+        found = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
+        if self.ent_coef_optimizer is not None:
+            found["ent_coef"] = self.ent_coef_optimizer
+        return found
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._exploration.fit(self, self.n_envs, self.env)  # validates
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
+        total, reset = self._checkpoints.remaining(total_timesteps, reset_num_timesteps)
+        before = self._last_obs
+        total_timesteps, callback = super()._setup_learn(total, callback, reset, *args, **kwargs)
+        self._exploration.fit(self, self.n_envs, self.env)
+        if self._last_obs is not before:  # environments were reset
+            self._exploration.restart()
+        self._guard.restart(self._checkpoints.path)
+        normalized = self._vec_normalize_env is not None
+        first = self._last_original_obs if normalized else self._last_obs
+        check_experience({"observations": first}, self.num_timesteps, ENVIRONMENT)
+        self._runtime.plan(self._n_updates, self._planned_updates(total_timesteps))
+        return total_timesteps, callback
+
     def _planned_updates(self, total_timesteps: int) -> float:
         """Count the updates still to come; an estimate where episodes decide."""
         steps = max(0, total_timesteps - max(self.num_timesteps, self.learning_starts))
@@ -186,11 +342,101 @@ class EngineFlow(OffPolicyFlow):
         assert isinstance(self.train_freq, TrainFreq)
         return steps / self.env.num_envs * self.gradient_steps / self.train_freq.frequency
 
-    def _stateful_parts(self) -> dict[str, Any]:
-        return {**super()._stateful_parts(), "engine": self._runtime}
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any
+    ) -> RolloutReturn:
+        """Collect experience as SB3 does, after writing a checkpoint if one is due."""
+        if not self._checkpoints.between_rollouts({"model": callback}):
+            return RolloutReturn(0, 0, continue_training=False)
+        return super().collect_rollouts(env, callback, *args, **kwargs)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        random_steps = learning_starts if self.random_steps is None else self.random_steps
+        engine = noise = None
+        if self.num_timesteps >= random_steps:
+            engine = self._runtime.engine() if self._runtime.is_running else None
+            noise = self._exploration.next()
+        if engine is not None and engine.compiled:
+            obs = engine.networks.observations.pack(self._last_obs, self.device)
+            if noise is not None:
+                noise = noise.to(engine.networks.actor.data).unsqueeze(0)
+            scaled = engine.act(obs.unsqueeze(0), noise).squeeze(0)
+        elif noise is None:
+            return super()._sample_action(random_steps, action_noise, n_envs)
+        else:
+            # As SB3 does, except that the noise is given.
+            self.policy.set_training_mode(False)
+            obs, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+            actor = self.policy.actor
+            assert isinstance(actor, FlowActor)
+            with th.no_grad():
+                scaled = actor(obs, noise=noise.to(next(actor.parameters())))
+        actions = scaled.cpu().numpy()
+        check_finite(actions)
+        actions = actions.reshape(n_envs, *(self.action_space.shape or ()))
+        if action_noise is not None:
+            actions = np.clip(actions + action_noise(), -1, 1)
+        return self.policy.unscale_action(actions), actions
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        seen, earned = new_obs, reward
+        if self._vec_normalize_env is not None:  # which would clip infinity
+            seen, earned = self._vec_normalize_env.old_obs, self._vec_normalize_env.old_reward
+        check_step(seen, earned, dones, infos, self.num_timesteps)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._exploration.restart(dones)
+
+    def get_parameters(self) -> dict[str, dict]:
+        """Return the parameters as SB3 does, as copies that share no memory with others."""
+        return _copies(super().get_parameters())
+
+    def _describe_run(self) -> Run:
+        """Describe what a checkpoint of this model consists of."""
+        return Run(
+            kind=type(self).__name__,
+            agents={"model": self},
+            environments={"model": self.env},
+            ring=self._ring,
+            extra=self._run_state,
+            set_extra=self._load_run_state,
+        )
+
+    def _ring(self) -> Ring | None:
+        buffer = self.replay_buffer
+        if buffer is None or not is_plain(buffer):
+            return None
+        columns = {name: getattr(buffer, name) for name in COLUMNS}
+        return Ring(columns, buffer.pos, buffer.full, buffer)
+
+    def _run_state(self) -> dict[str, Any]:
+        self._guard.look()  # a checkpoint is finite
+        return {"exploration": self._exploration.state(), "engine": self._runtime.state()}
+
+    def _load_run_state(self, state: dict[str, Any]) -> None:
+        self._exploration.load_state(state["exploration"])
+        self._runtime.load_state(state["engine"])
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_runtime"]
+        return [*super()._excluded_save_params(), "_guard", "_checkpoints", "_runtime"]
+
+
+def _copies(value: Any) -> Any:
+    """Copy tensors: views would bring the whole memory that they look at into a file."""
+    if isinstance(value, th.Tensor):
+        return value.detach().clone()
+    if isinstance(value, dict):
+        return type(value)((key, _copies(part)) for key, part in value.items())
+    return [_copies(part) for part in value] if isinstance(value, list) else value
 
 
 def warn_of_stock_loop(reason: str) -> None:

@@ -26,7 +26,7 @@ from sb3_flowpolicy.common.validation import (
     or_schedule,
 )
 from sb3_flowpolicy.engine import EngineRuntime
-from sb3_flowpolicy.engine.ppo_engine import PPOEngine, build_ppo_engine, why_ppo_unsupported
+from sb3_flowpolicy.engine.ppo_engine import PPOEngine
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite
 from sb3_flowpolicy.policies import on_policy
 
@@ -84,9 +84,7 @@ class PPOFlow(PPO):
         check_settings({**given, "compile": compile}, _SETTINGS)
         check_policy(given.get("policy"), ActorCriticPolicy, self.policy_aliases)
         self.compile: bool | Literal["auto"] = compile
-        self._runtime = EngineRuntime(
-            [self], why_ppo_unsupported, build_ppo_engine, warn_of_stock_loop
-        )
+        self._runtime = EngineRuntime([self], PPOEngine, warn_of_stock_loop)
         super().__init__(*args, **kwargs)
 
     def learn(

@@ -11,7 +11,6 @@ from sb3_contrib.common.torch_layers import BatchRenorm1d
 from sb3_contrib.crossq.policies import CrossQCritic
 from torch import nn
 
-from sb3_flowpolicy.engine.adam import adam_step
 from sb3_flowpolicy.engine.renorm import RenormNetworks
 from sb3_flowpolicy.engine.sac import SACObjective
 from sb3_flowpolicy.engine.update import (
@@ -22,6 +21,9 @@ from sb3_flowpolicy.engine.update import (
     UpdateSettings,
     bellman_targets,
     entropy_coefficient,
+    gradient_of,
+    stack_losses,
+    step,
     step_entropy_coefficient,
 )
 from sb3_flowpolicy.policies.crossq import CrossQFlowActor
@@ -81,22 +83,15 @@ class CrossQObjective(SACObjective):
         def update(
             state: TrainState, batch: Batch, learning_rates: th.Tensor, moves_actor: bool
         ) -> th.Tensor:
-            actor_statistics, critic_statistics, actor_steps, critic_steps = state.others
             ent_coef = entropy_coefficient(state, settings)
             with th.no_grad():
                 next_actions, next_log_prob, _ = networks.sample_with(
-                    state.actor,
-                    actor_statistics,
-                    actor_steps,
-                    batch.next_obs,
-                    batch.noise[1],
-                    training=False,
+                    state.actor, state.others, batch.next_obs, batch.noise[1], training=False
                 )
             critic = state.critic.detach().requires_grad_()
-            outputs, new_statistics = networks.q_values_with(
+            outputs, statistics = networks.q_values_with(
                 critic,
-                critic_statistics,
-                critic_steps,
+                state.others,
                 th.cat([batch.obs, batch.next_obs], dim=1),
                 th.cat([batch.actions, next_actions], dim=1),
                 training=True,
@@ -106,53 +101,27 @@ class CrossQObjective(SACObjective):
                 batch, self.next_values(following.detach()), ent_coef * next_log_prob
             )
             critic_loss = self.critic_loss(current, targets)
-            (gradient,) = th.autograd.grad(critic_loss.sum(), critic)
-            new_critic, *critic_moments = adam_step(
-                state.critic,
-                gradient,
-                *state.critic_moments,
-                learning_rates[1],
-                settings.critic_adam,
-            )
+            gradient, moments = gradient_of(critic_loss, critic), state.critic_moments
+            step(state.critic, gradient, moments, learning_rates[1], settings.critic_adam)
+            networks.write_statistics(state.others, statistics, of_critics=True)
 
             ent_coef_loss, actor_loss = th.zeros_like(ent_coef), th.zeros_like(critic_loss)
             if moves_actor:
                 actor = state.actor.detach().requires_grad_()
-                actions_pi, log_prob, new_actor_statistics = networks.sample_with(
-                    actor, actor_statistics, actor_steps, batch.obs, batch.noise[0], training=True
+                actions_pi, log_prob, statistics = networks.sample_with(
+                    actor, state.others, batch.obs, batch.noise[0], training=True
                 )
                 ent_coef_loss = step_entropy_coefficient(
                     state, log_prob, learning_rates[2], settings
                 )
                 outputs, _ = networks.q_values_with(
-                    new_critic,
-                    {**networks.critic_statistics.unflatten(critic_statistics), **new_statistics},
-                    critic_steps,
-                    batch.obs,
-                    actions_pi,
-                    training=False,
+                    state.critic, state.others, batch.obs, actions_pi, training=False
                 )
                 actor_loss = (ent_coef * log_prob - self.actor_values(outputs)).mean(-1)
-                (gradient,) = th.autograd.grad(actor_loss.sum(), actor)
-                stepped = adam_step(
-                    state.actor,
-                    gradient,
-                    *state.actor_moments,
-                    learning_rates[0],
-                    settings.actor_adam,
-                )
-                _write(networks.actor_statistics.unflatten(actor_statistics), new_actor_statistics)
-                actor_steps.add_(1)
-                for old, new in zip((state.actor, *state.actor_moments), stepped, strict=True):
-                    old.copy_(new)
-
-            _write(networks.critic_statistics.unflatten(critic_statistics), new_statistics)
-            critic_steps.add_(1)
-            olds = (state.critic, *state.critic_moments)
-            for old, new in zip(olds, (new_critic, *critic_moments), strict=True):
-                old.copy_(new)
-            losses = ent_coef.squeeze(-1), ent_coef_loss.squeeze(-1), critic_loss, actor_loss
-            return th.stack([loss.detach() for loss in losses])
+                gradient, moments = gradient_of(actor_loss, actor), state.actor_moments
+                step(state.actor, gradient, moments, learning_rates[0], settings.actor_adam)
+                networks.write_statistics(state.others, statistics, of_critics=False)
+            return stack_losses(ent_coef, ent_coef_loss, critic_loss, actor_loss)
 
         return update
 
@@ -163,8 +132,3 @@ def _constants(network: nn.Module) -> tuple[tuple[float, ...], ...]:
         for layer in network.children()
         if isinstance(layer, BatchRenorm1d)
     )
-
-
-def _write(olds: dict[str, th.Tensor], news: dict[str, th.Tensor]) -> None:
-    for name, new in news.items():
-        olds[name].copy_(new)

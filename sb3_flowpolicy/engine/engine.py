@@ -2,68 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch as th
-from torch import nn
 
-from sb3_flowpolicy.engine.adam import FlatAdam, why_optimizer_unsupported
+from sb3_flowpolicy.engine.adam import FlatAdam
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.engine.observations import why_space_unsupported
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
-from sb3_flowpolicy.engine.update import (
-    LOSSES,
-    Batch,
-    Moments,
-    Objective,
-    TrainState,
-    UpdateSettings,
-)
+from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
+from sb3_flowpolicy.engine.update import LOSSES, Batch, Moments, TrainState, UpdateSettings
 from sb3_flowpolicy.policies import FlowActor
-
-# Layers that behave differently in training, or draw random numbers of their own.
-MODE_DEPENDENT = (
-    nn.modules.batchnorm._BatchNorm,
-    nn.modules.dropout._DropoutNd,
-    nn.RReLU,
-)
-
-
-def why_unsupported(model: Any) -> str | None:
-    """Return what about a model the engine does not support; None if it supports everything."""
-    policy, objective = model.policy, model.objective()
-    if not isinstance(policy.actor, FlowActor):
-        return f"actor of type {type(policy.actor).__name__}"
-    if type(policy.critic) is not objective.critic_type:
-        return f"critic of type {type(policy.critic).__name__}"
-    reason = why_space_unsupported(model.observation_space)
-    if reason is not None:
-        return reason
-    if any(True for _ in policy.critic.features_extractor.parameters()):
-        return "features extractor with parameters"
-    for module in policy.modules():
-        if isinstance(module, MODE_DEPENDENT):
-            return f"layer of type {type(module).__name__}"
-    for network in policy.critic.q_networks:
-        for layer in network.children():
-            known = isinstance(layer, objective.layer_types)
-            if not known and any(True for _ in layer.parameters()):
-                return f"critic layer of type {type(layer).__name__}, which has parameters"
-    for layer in policy.critic.modules():
-        known = isinstance(layer, objective.layer_types)
-        if not known and any(True for _ in layer.buffers(recurse=False)):
-            return "critic with buffers"
-    for parameter in (*policy.actor.parameters(), *policy.critic.parameters()):
-        if not parameter.requires_grad or parameter._backward_hooks:
-            return "parameters that are frozen or have hooks"
-    for network in (policy.actor, policy.critic):
-        reason = why_optimizer_unsupported(network.optimizer, network)
-        if reason is not None:
-            return reason
-    return objective.why_unsupported(policy)
 
 
 def settings_key(model: Any) -> tuple[object, ...]:
@@ -78,41 +31,31 @@ def settings_key(model: Any) -> tuple[object, ...]:
     return (objective, model.tau, model.target_entropy, *adam, *constants)
 
 
-def build_engine(models: Sequence[Any], compiled: bool) -> Engine:
-    """Make the engine that the models' settings ask for."""
-    return Engine(models, compiled, models[0].autocast)
-
-
-class Engine:
-    """Updates S models in lockstep. Their modules and optimizers become views of its tensors.
+class Engine(BoundEngine):
+    """Updates S models of SAC, TQC or CrossQ in lockstep.
 
     Args:
         models: S models that differ in nothing but weights, data and random numbers. Their method
             ``objective()`` says what they do with their critics.
-        compiled: Whether to compile the update. Where no compiler works, it runs eagerly, with
-            one warning and the same numbers.
-        autocast: Whether matrix products of updates run in bfloat16.
+        compiled: Whether to compile the update and the policy. Where no compiler works, both run
+            eagerly, with one warning and the same numbers.
     """
 
-    def __init__(
-        self,
-        models: Sequence[Any],
-        compiled: bool = False,
-        autocast: bool = False,
-    ) -> None:
-        self.models = list(models)
-        self.compiled = compiled
-        self.autocast = autocast
+    def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
+        super().__init__(models, compiled)
         first = self.models[0]
-        self.objective: Objective = first.objective()
+        self.autocast = first.autocast
+        self.objective = first.objective()
         policies = [model.policy for model in self.models]
-        self.networks = self.objective.networks_type(policies, autocast)
+        self.networks = self.objective.networks_type(policies, self.autocast)
         self.actor_adam = FlatAdam(
-            self.networks.actor, [model.policy.actor.optimizer for model in self.models]
+            self.networks.actor, [policy.actor.optimizer for policy in policies]
         )
         self.critic_adam = FlatAdam(
-            self.networks.critic, [model.policy.critic.optimizer for model in self.models]
+            self.networks.critic, [policy.critic.optimizer for policy in policies]
         )
+        self.parts = [self.networks.actor, self.networks.critic, *self.networks.others]
+        self.parts += [self.actor_adam, self.critic_adam]
         self.log_ent_coef: FlatParameters | None = None
         self.ent_coef_adam: FlatAdam | None = None
         if first.ent_coef_optimizer is not None:
@@ -122,26 +65,28 @@ class Engine:
             )
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)
-        learned = self.ent_coef_adam
+            self.parts += [self.log_ent_coef, self.ent_coef_adam]
         settings = UpdateSettings(
             objective=self.objective,
             tau=first.tau,
             target_entropy=float(first.target_entropy),
             actor_adam=self.actor_adam.settings,
             critic_adam=self.critic_adam.settings,
-            ent_coef_adam=None if learned is None else learned.settings,
+            ent_coef_adam=None if self.ent_coef_adam is None else self.ent_coef_adam.settings,
         )
-        self.settings_key = settings_key(first)
-        self._identities = [_identity(model) for model in self.models]
-        self._slots = [slot for model in self.models for slot in _slots(model)]
-        self._update = self.objective.make_update(self.networks, settings)
-        device = self.networks.actor.data.device
-        self._compiled_update = Compiled(self._update, f"the {self.objective.name} update", device)
-        networks = self.networks
+        self._key = settings_key(first)
+        places = [place for model in self.models for place in _places(model)]
+        things = [home[name] for home, name in places]
+        self._note(places, [thing for thing in things if isinstance(thing, th.Tensor)])
+        networks, device = self.networks, self.networks.actor.data.device
 
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
             return networks.sample(actor, obs, noise)[0]
 
+        self._update = self.objective.make_update(networks, settings)
+        self._compiled_update = Compiled(self._update, f"the {self.objective.name} update", device)
+        self._sample = sample
+        self._compiled_sample = Compiled(sample, "the policy", device)
         #: Losses of each update of the last :meth:`train`, (4, S): to find out which went wrong.
         self.history: list[th.Tensor] = []
         #: Names of the losses to log of the last :meth:`train`.
@@ -151,42 +96,45 @@ class Engine:
         self._grouped: tuple[int, list[tuple[slice, TrainState]]] | None = None
         self._fixed: list[tuple[th.Tensor, int]] = []
         self._learning_rates: tuple[list[float], th.Tensor] | None = None
-        self._sample = sample
-        self._compiled_sample = Compiled(sample, "the policy", device)
+
+    @staticmethod
+    def why_unsupported(model: Any) -> str | None:
+        """Return what about a model the engine does not support; None if it supports everything."""
+        policy, objective = model.policy, model.objective()
+        if objective is None:
+            return f"the update of {type(model).__name__}"
+        if not isinstance(policy.actor, FlowActor):
+            return f"actor of type {type(policy.actor).__name__}"
+        if type(policy.critic) is not objective.critic_type:
+            return f"critic of type {type(policy.critic).__name__}"
+        reason = why_space_unsupported(model.observation_space)
+        if reason is not None:
+            return reason
+        if _has_tensors(policy.critic.features_extractor):
+            return "features extractor with parameters or buffers"
+        for network in policy.critic.q_networks:
+            for layer in network.children():
+                if not isinstance(layer, objective.layer_types) and _has_tensors(layer):
+                    return f"critic layer of type {type(layer).__name__}, which has parameters"
+        for network in (policy.actor, policy.critic):
+            reason = why_network_unsupported(network)
+            if reason is not None:
+                return reason
+        return objective.why_unsupported(policy)
 
     def _runs_compiled(self) -> bool:
         """Whether to call compiled functions: not after one could not be compiled."""
         broken = self._compiled_update.broken or self._compiled_sample.broken
         return self.compiled and not broken
 
-    def fits(self, models: Sequence[Any]) -> bool:
-        """Whether these still are the models, with the same networks, optimizers and constants."""
-        first = models[0]
-        if self.autocast != first.autocast or self.settings_key != settings_key(first):
-            return False
-        for model, kept in zip(models, self._identities, strict=True):
-            if any(now is not then for now, then in zip(_identity(model), kept, strict=True)):
-                return False
-        return all(
-            home[name] is tensor and (tensor.requires_grad, tensor.dtype, tensor.device) == kind
-            for home, name, tensor, kind in self._slots
-        )
-
-    def _parts(self) -> list[FlatParameters | FlatAdam]:
-        parts = [self.networks.actor, self.networks.critic, *self.networks.others]
-        return [
-            *(part for part in (*parts, self.log_ent_coef) if part is not None),
-            self.actor_adam,
-            self.critic_adam,
-            *([self.ent_coef_adam] if self.ent_coef_adam is not None else []),
-        ]
+    def fits(self) -> bool:
+        """Whether the models have the same networks, optimizers and constants as at the start."""
+        first = self.models[0]
+        same = self.autocast == first.autocast and self._key == settings_key(first)
+        return same and self._has_same_things()
 
     def synchronize(self) -> bool:
-        """Take over what was loaded or moved since the last update.
-
-        Returns:
-            Whether parameters or optimizer states were.
-        """
+        """Take over what was loaded or moved since the last update; return whether anything was."""
         # A fixed entropy coefficient may be replaced between two calls, or changed in place.
         fixed = [(tensor, tensor._version) for tensor in self._fixed_ent_coefs()]
         if len(fixed) != len(self._fixed) or any(
@@ -194,18 +142,10 @@ class Engine:
             for (now, version), (then, before) in zip(fixed, self._fixed, strict=True)
         ):
             self._state, self._fixed = None, fixed
-        parts = self._parts()
-        if all(part.is_bound() for part in parts):
-            return False
-        for part in parts:
-            part.bind()
-        self._state = None
-        return True
-
-    def release(self) -> None:
-        """Give modules and optimizers memory of their own, until :meth:`synchronize`."""
-        for part in self._parts():
-            part.release()
+        changed = super().synchronize()
+        if changed:
+            self._state = None
+        return changed
 
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
@@ -226,9 +166,20 @@ class Engine:
             return self._compiled_sample((obs.shape, obs.dtype), actor, obs, noise)
         return self._sample(actor, obs, noise)
 
-    def has_compiled_policy(self, obs: th.Tensor) -> bool:
-        """Whether :meth:`act` has a graph for observations of this shape and type."""
-        return self._runs_compiled() and (obs.shape, obs.dtype) in self._compiled_sample
+    def act_if_compiled(self, obs: Any, deterministic: bool) -> np.ndarray | None:
+        """Act for one seed if there is a graph for so many observations, as tensors (N, ...).
+
+        Returns:
+            Scaled actions, (N, D), or None.
+        """
+        rows = self.networks.observations.pack(obs).unsqueeze(0).contiguous()
+        if not self._runs_compiled() or (rows.shape, rows.dtype) not in self._compiled_sample:
+            return None
+        noise = None
+        if deterministic:  # the mode is the image of no noise
+            shape = (*rows.shape[:2], self.networks.noise_dim)
+            noise = self.networks.actor.data.new_zeros(shape)
+        return self.act(rows, noise).squeeze(0).cpu().numpy()
 
     def state(self) -> TrainState:
         """Return the tensors that an update changes."""
@@ -339,40 +290,31 @@ def _can_be_rows(model: Any) -> bool:
     return buffer.observations.dtype.kind == "f"
 
 
-def _identity(model: Any) -> tuple[object, ...]:
-    """Return the objects whose tensors an engine has bound."""
-    return (
-        model.policy,
-        model.actor.optimizer,
-        model.critic.optimizer,
-        model.ent_coef_optimizer,
-        model.log_ent_coef,
-    )
-
-
-_Slot = tuple[Mapping[str, th.Tensor | None], str, th.Tensor, tuple[bool, th.dtype, th.device]]
-
-
-def _slots(model: Any) -> list[_Slot]:
-    """Return where tensors are, the tensors, whether they train, and their type and device.
+def _places(model: Any) -> list[Place]:
+    """Return where the objects are whose tensors an engine binds.
 
     Of each network's parameters the first is enough: they are replaced, frozen, or moved all at
     once, by ``load_state_dict(assign=True)`` or ``actor.requires_grad_(False)`` for example. Of the
     layers' buffers, which ``policy.to(dtype)`` replaces, all are returned.
     """
-    homes: list[tuple[Mapping[str, th.Tensor | None], str]] = []
+    places: list[Place] = [
+        (vars(model), "policy"),
+        (vars(model.actor), "optimizer"),
+        (vars(model.critic), "optimizer"),
+        (vars(model), "ent_coef_optimizer"),
+        (vars(model), "log_ent_coef"),
+    ]
     layer_types = model.objective().layer_types
     targets = [model.critic_target] if hasattr(model, "critic_target") else []
     for network in (model.actor, model.critic, *targets):
         path, _ = next(network.named_parameters())
         module, _, name = path.rpartition(".")
-        homes.append((network.get_submodule(module)._parameters, name))
+        places.append((network.get_submodule(module)._parameters, name))
         for layer in network.modules():
             if isinstance(layer, layer_types):
-                homes += [(layer._buffers, key) for key in layer._buffers]
-    slots = []
-    for home, name in homes:
-        tensor = home[name]
-        assert tensor is not None
-        slots.append((home, name, tensor, (tensor.requires_grad, tensor.dtype, tensor.device)))
-    return slots
+                places += [(layer._buffers, key) for key in layer._buffers]
+    return places
+
+
+def _has_tensors(module: th.nn.Module) -> bool:
+    return any(True for _ in (*module.parameters(), *module.buffers()))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch as th
 from torch import nn
 from torch.func import functional_call, vmap
+from torch.utils._pytree import tree_leaves, tree_map
 
 from sb3_flowpolicy.engine.flat import FlatParameters, Layout
 from sb3_flowpolicy.engine.observations import Observations
 from sb3_flowpolicy.policies import FlowActor
+
+Tensors = dict[str, th.Tensor]
 
 
 class _ActionLogProb(nn.Module):
@@ -69,27 +72,27 @@ class StackedNetworks:
         """
         parameters = self.actor.unflatten(actor)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
-            if len(actor) > 1:
-                actions, log_prob = vmap(self._sample_one)(parameters, obs, noise)
-            else:
-                # Without vmap for one seed: it would turn products into slower, batched ones.
-                single = {name: value.squeeze(0) for name, value in parameters.items()}
-                actions, log_prob = self._sample_one(single, obs.squeeze(0), noise.squeeze(0))
-                actions, log_prob = actions.unsqueeze(0), log_prob.unsqueeze(0)
+            actions, log_prob = per_seed(self._sample_one, parameters, obs, noise)
         return actions.to(actor.dtype), log_prob.to(actor.dtype)
 
-    def _sample_one(
-        self, parameters: dict[str, th.Tensor], obs: th.Tensor, noise: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def _sample_one(self, parameters: Tensors, obs: th.Tensor, noise: th.Tensor) -> Any:
         return functional_call(self._sampler, parameters, (obs, noise))
 
-    def q_values(self, critic: th.Tensor, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def q_values(
+        self,
+        critic: th.Tensor,
+        obs: th.Tensor,
+        actions: th.Tensor,
+        normalize: Callable[[str, nn.Module, Tensors, th.Tensor], th.Tensor] | None = None,
+    ) -> th.Tensor:
         """Evaluate all critics of all seeds: each layer is one batched product.
 
         Args:
             critic: Flat parameters of critics or target critics, (S, P).
             obs: Observations, (S, B, ...).
             actions: Scaled actions, (S, B, D).
+            normalize: Applies layers other than linear ones: given a layer's name, the layer, all
+                parameters, and its input, it returns the output.
 
         Returns:
             Values or quantiles, (S, C, B, Q).
@@ -101,6 +104,8 @@ class StackedNetworks:
                 if isinstance(layer, nn.Linear):
                     weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
                     hidden = hidden @ weight.mT + bias.unsqueeze(-2)
+                elif normalize is not None:
+                    hidden = normalize(name, layer, parameters, hidden)
                 else:
                     hidden = layer(hidden)
         return hidden.to(critic.dtype)
@@ -112,6 +117,15 @@ class StackedNetworks:
         features = self._critic.extract_features(rows, extractor)
         features = features.unflatten(0, obs.shape[:2])
         return th.cat([features, actions], dim=-1).unsqueeze(1)
+
+
+def per_seed(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Map a function over the leading dimension, one entry per seed, of trees of tensors."""
+    if len(tree_leaves(arguments)[0]) > 1:
+        return vmap(function)(*arguments)
+    # Without vmap for one seed: it would turn products into slower, batched ones.
+    outputs = function(*tree_map(lambda tensor: tensor.squeeze(0), arguments))
+    return tree_map(lambda tensor: tensor.unsqueeze(0), outputs)
 
 
 def _actor_layout(policy: Any) -> Layout:

@@ -11,9 +11,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
-from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings, why_optimizer_unsupported
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
 from sb3_flowpolicy.engine.compiling import Compiled
-from sb3_flowpolicy.engine.engine import MODE_DEPENDENT
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.ppo_update import (
     PPO_LOSSES,
@@ -23,71 +22,38 @@ from sb3_flowpolicy.engine.ppo_update import (
     make_ppo_update,
     policy_function,
 )
+from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
 from sb3_flowpolicy.engine.update import Moments
 from sb3_flowpolicy.policies.base import check_finite
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic
 
 
-def why_ppo_unsupported(model: PPO) -> str | None:
-    """Return what about a model the engine does not support; None if it supports everything."""
-    policy = model.policy
-    if not isinstance(policy, DensityActorCritic):
-        return f"policy of type {type(policy).__name__}"
-    if type(model.rollout_buffer) is not RolloutBuffer:
-        return f"rollout buffer of type {type(model.rollout_buffer).__name__}"
-    for module in policy.modules():
-        if isinstance(module, MODE_DEPENDENT):
-            return f"layer of type {type(module).__name__}"
-    for parameter in policy.parameters():
-        if not parameter.requires_grad or parameter._backward_hooks:
-            return "parameters that are frozen or have hooks"
-    return why_optimizer_unsupported(policy.optimizer, policy)
-
-
-def _settings(model: PPO) -> PPOSettings:
-    adam = adam_settings(model.policy.optimizer)
-    assert adam is not None
-    return PPOSettings(
-        adam,
-        model.ent_coef,
-        model.vf_coef,
-        model.max_grad_norm,
-        model.normalize_advantage,
-        model.clip_range_vf is not None,
-        model.target_kl,
-    )
-
-
-def build_ppo_engine(models: Sequence[PPO], compiled: bool) -> PPOEngine:
-    """Make the engine of one model."""
-    (model,) = models
-    return PPOEngine(model, compiled)
-
-
-class PPOEngine:
+class PPOEngine(BoundEngine):
     """Acts with and updates one policy, whose parameters become views of its tensor.
 
     Args:
-        model: A PPOFlow model for which :func:`why_ppo_unsupported` returns None.
+        models: One PPOFlow model for which :meth:`why_unsupported` returns None.
         compiled: Whether to compile. Where no compiler works, everything runs eagerly, with one
             warning and the same numbers.
     """
 
-    def __init__(self, model: PPO, compiled: bool = True) -> None:
+    def __init__(self, models: Sequence[PPO], compiled: bool = True) -> None:
+        super().__init__(models, compiled)
+        (model,) = models
         policy = model.policy
         assert isinstance(policy, DensityActorCritic)
         self.model, self.policy, self.optimizer = model, policy, policy.optimizer
-        self.compiled = compiled
         names = {f"policy.{name}": [value] for name, value in policy.named_parameters()}
         self.flat = FlatParameters([names])
         self.adam = FlatAdam(self.flat, [policy.optimizer])
-        self._kind = _kind(self.flat.data)
-        self._slots = [
-            (module._parameters, name, parameter)
+        self.parts = [self.flat, self.adam]
+        places: list[Place] = [
+            (module._parameters, name)
             for module in policy.modules()
             for name, parameter in module._parameters.items()
             if parameter is not None
         ]
+        self._note(places, [next(policy.parameters())])
         self.settings = _settings(model)
         device = self.flat.data.device
         self._eager_update = make_ppo_update(policy, self.flat, self.settings)
@@ -96,30 +62,21 @@ class PPOEngine:
         self._act = Compiled(act, "the policy", device)
         self._update.broken = self._act.broken = not compiled
 
-    def fits(self, models: Sequence[PPO]) -> bool:
+    @staticmethod
+    def why_unsupported(model: PPO) -> str | None:
+        """Return what about a model the engine does not support; None if it supports everything."""
+        if not isinstance(model.policy, DensityActorCritic):
+            return f"policy of type {type(model.policy).__name__}"
+        if type(model.rollout_buffer) is not RolloutBuffer:
+            return f"rollout buffer of type {type(model.rollout_buffer).__name__}"
+        return why_network_unsupported(model.policy)
+
+    def fits(self) -> bool:
         """Whether the model still has the same policy, optimizer and constants."""
-        (model,) = models
+        model = self.model
         same = model.policy is self.policy and self.policy.optimizer is self.optimizer
-        same = same and self._has_same_parameters()
-        return same and why_ppo_unsupported(model) is None and self.settings == _settings(model)
-
-    def _has_same_parameters(self) -> bool:
-        """Whether the policy has the same parameters, of the same type and on the same device."""
-        same = all(home[name] is parameter for home, name, parameter in self._slots)
-        return same and _kind(self._slots[0][2]) == self._kind
-
-    def synchronize(self) -> bool:
-        """Take over parameters or optimizer states that were replaced since the last call."""
-        if self.flat.is_bound() and self.adam.is_bound():
-            return False
-        self.flat.bind()
-        self.adam.bind()
-        return True
-
-    def release(self) -> None:
-        """Give the policy and its optimizer memory of their own."""
-        self.flat.release()
-        self.adam.release()
+        same = same and self._has_same_things()
+        return same and self.why_unsupported(model) is None and self.settings == _settings(model)
 
     @contextmanager
     def collecting(self, watched: bool = True) -> Iterator[None]:
@@ -152,7 +109,7 @@ class PPOEngine:
         self, obs: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Act with the parameters that the policy has now."""
-        if not self._has_same_parameters():  # a new engine follows at the next rollout
+        if not self._has_same_things():  # a new engine follows at the next rollout
             return type(self.policy).forward(self.policy, obs, deterministic)
         self.synchronize()
         return self.act(obs, deterministic)
@@ -210,5 +167,15 @@ class PPOEngine:
         return self._update(len(samples.actions), state, batch, scalars)
 
 
-def _kind(tensor: th.Tensor) -> tuple[th.dtype, th.device]:
-    return tensor.dtype, tensor.device
+def _settings(model: PPO) -> PPOSettings:
+    adam = adam_settings(model.policy.optimizer)
+    assert adam is not None
+    return PPOSettings(
+        adam,
+        model.ent_coef,
+        model.vf_coef,
+        model.max_grad_norm,
+        model.normalize_advantage,
+        model.clip_range_vf is not None,
+        model.target_kl,
+    )

@@ -9,13 +9,11 @@ from typing import Any
 import torch as th
 from sb3_contrib.common.torch_layers import BatchRenorm
 from torch import nn
-from torch.func import functional_call, vmap
+from torch.func import functional_call
 from torch.nn.functional import linear
 
 from sb3_flowpolicy.engine.flat import FlatParameters
-from sb3_flowpolicy.engine.networks import StackedNetworks
-
-Tensors = dict[str, th.Tensor]
+from sb3_flowpolicy.engine.networks import StackedNetworks, Tensors, per_seed
 
 
 def renormalize(
@@ -74,59 +72,44 @@ class _Density(nn.Module):
 class RenormNetworks(StackedNetworks):
     """Networks of CrossQ: instead of target networks they have running statistics.
 
-    Its functions return new statistics where they are told to use those of the batch, which are
-    named as in :attr:`actor_statistics` and :attr:`critic_statistics`.
-
-    Args:
-        policies: As for the parent class.
-        autocast: As for the parent class.
+    Those are the entries ``others`` of the state: of the actor and of the critics, and how many
+    steps each have been updated. With ``training``, functions use the statistics of the batch, and
+    also return new running ones by name.
     """
 
     def _others(self, policies: Sequence[Any]) -> list[FlatParameters]:
         actors = [[policy.actor.latent_pi] for policy in policies]
         critics = [policy.critic.q_networks for policy in policies]
-        self.actor_statistics = _buffers(actors, counts=False, copies=False)
-        self.critic_statistics = _buffers(critics, counts=False, copies=True)
-        self.actor_steps, self.critic_steps = (_buffers(n, True, True) for n in (actors, critics))
         self._actor, self._density = policies[0].actor, _Density(policies[0].actor.density)
         return [
-            self.actor_statistics,
-            self.critic_statistics,
-            self.actor_steps,
-            self.critic_steps,
+            _buffers(actors, counts=False, copies=False),
+            _buffers(critics, counts=False, copies=True),
+            _buffers(actors, counts=True, copies=True),
+            _buffers(critics, counts=True, copies=True),
         ]
 
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
         """Sample with the running statistics, as the parent class does."""
-        statistics, steps = self.actor_statistics.data, self.actor_steps.data
-        return self.sample_with(actor, statistics, steps, obs, noise, training=False)[:2]
+        others = [part.data for part in self.others]
+        return self.sample_with(actor, others, obs, noise, training=False)[:2]
 
     def sample_with(
         self,
         actor: th.Tensor,
-        statistics: th.Tensor,
-        steps: th.Tensor,
+        others: Sequence[th.Tensor],
         obs: th.Tensor,
         noise: th.Tensor,
         training: bool,
     ) -> tuple[th.Tensor, th.Tensor, Tensors]:
         """Sample actions (S, B, D) and their log-probabilities (S, B)."""
-        parameters = self.actor.unflatten(actor)
-        buffers = self.actor_statistics.unflatten(statistics)
+        parameters, statistics = self.actor.unflatten(actor), self.others[0].unflatten(others[0])
         one = partial(self._sample_one_seed, training=training)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
-            if len(actor) > 1:
-                actions, log_prob, new = vmap(one)(parameters, buffers, steps[:, :1], obs, noise)
-            else:
-                parameters, buffers = (
-                    {name: value.squeeze(0) for name, value in part.items()}
-                    for part in (parameters, buffers)
-                )
-                found = one(parameters, buffers, steps[0, :1], obs.squeeze(0), noise.squeeze(0))
-                actions, log_prob = found[0].unsqueeze(0), found[1].unsqueeze(0)
-                new = {name: value.unsqueeze(0) for name, value in found[2].items()}
+            actions, log_prob, new = per_seed(
+                one, parameters, statistics, others[2][:, :1], obs, noise
+            )
         return actions.to(actor.dtype), log_prob.to(actor.dtype), new
 
     def _sample_one_seed(
@@ -158,30 +141,31 @@ class RenormNetworks(StackedNetworks):
     def q_values_with(
         self,
         critic: th.Tensor,
-        statistics: th.Tensor | Tensors,
-        steps: th.Tensor,
+        others: Sequence[th.Tensor],
         obs: th.Tensor,
         actions: th.Tensor,
         training: bool,
     ) -> tuple[th.Tensor, Tensors]:
         """Evaluate all critics of all seeds, (S, C, B, 1)."""
-        if isinstance(statistics, th.Tensor):
-            statistics = self.critic_statistics.unflatten(statistics)
-        parameters = self.critic.unflatten(critic)
+        statistics, steps = self.others[1].unflatten(others[1]), others[3][:, :1, None]
         new: Tensors = {}
-        hidden = self._critic_inputs(obs, actions)
-        with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
-            for name, layer in self._critic.q_networks[0].named_children():
-                own = _of(f"{name}.", parameters)
-                if isinstance(layer, BatchRenorm):
-                    values = {**own, **_of(f"{name}.", statistics), "steps": steps[:, :1, None]}
-                    hidden, found = renormalize(layer, hidden, values, training)
-                    new |= {f"{name}.{key}": value for key, value in found.items()}
-                elif isinstance(layer, nn.Linear):
-                    hidden = hidden @ own["weight"].mT + own["bias"].unsqueeze(-2)
-                else:
-                    hidden = layer(hidden)
-        return hidden.to(critic.dtype), new
+
+        def normalize(name: str, layer: Any, weights: Tensors, hidden: th.Tensor) -> th.Tensor:
+            if not isinstance(layer, BatchRenorm):
+                return layer(hidden)
+            values = {**_of(f"{name}.", {**weights, **statistics}), "steps": steps}
+            hidden, found = renormalize(layer, hidden, values, training)
+            new.update({f"{name}.{key}": value for key, value in found.items()})
+            return hidden
+
+        return self.q_values(critic, obs, actions, normalize), new
+
+    def write_statistics(self, others: Sequence[th.Tensor], new: Tensors, of_critics: bool) -> None:
+        """Overwrite the running statistics of the actor or the critics, and count the step."""
+        olds = self.others[of_critics].unflatten(others[of_critics])
+        for name, value in new.items():
+            olds[name].copy_(value)
+        others[2 + of_critics].add_(1)
 
 
 def _buffers(networks: Sequence[Sequence[nn.Module]], counts: bool, copies: bool) -> FlatParameters:

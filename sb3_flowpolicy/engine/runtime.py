@@ -2,36 +2,99 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
+import torch as th
+from torch import nn
+
+from sb3_flowpolicy.engine.adam import FlatAdam, why_optimizer_unsupported
 from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
+from sb3_flowpolicy.engine.flat import FlatParameters
 
 # Compiling pays after 1800 to 5000 updates, depending on width, density, and the number of seeds
 # (docs/engine.md).
 UPDATES_WORTH_COMPILING = 5000
+# Layers that behave differently in training, or draw random numbers of their own.
+_MODE_DEPENDENT = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd, nn.RReLU)
+# A dictionary, such as an object's ``__dict__``, and a key.
+Place = tuple[Mapping[str, Any], str]
 
 
-class Bound(Protocol):
-    """What a runtime asks of an engine."""
+class BoundEngine(ABC):
+    """Updates models whose parameters and optimizer states are views of its tensors.
 
-    compiled: bool
+    Args:
+        models: Models that differ in nothing but weights, data and random numbers.
+        compiled: Whether to compile. Where no compiler works, everything runs eagerly, with one
+            warning and the same numbers.
+    """
 
-    def fits(self, models: Sequence[Any]) -> bool:
-        """Whether these still are the models, with the same networks, optimizers and constants."""
+    #: Everything that is bound.
+    parts: list[FlatParameters | FlatAdam]
+
+    def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
+        self.models = list(models)
+        self.compiled = compiled
+        self._things: list[tuple[Mapping[str, Any], str, Any]] = []
+        self._kinds: list[tuple[th.Tensor, object]] = []
+
+    @staticmethod
+    @abstractmethod
+    def why_unsupported(model: Any) -> str | None:
+        """Return what about a model the engine does not support; None if it supports everything."""
+
+    @abstractmethod
+    def fits(self) -> bool:
+        """Whether the models have the same networks, optimizers and constants as at the start."""
+
+    def _note(self, places: Sequence[Place], probes: Sequence[th.Tensor]) -> None:
+        """Note what is bound: objects by where they are, and tensors by type and device."""
+        self._things = [(home, name, home[name]) for home, name in places]
+        self._kinds = [(tensor, _kind(tensor)) for tensor in probes]
+
+    def _has_same_things(self) -> bool:
+        """Whether none of what was noted was replaced, frozen or moved."""
+        for home, name, thing in self._things:
+            if home[name] is not thing:
+                return False
+        return all(_kind(tensor) == kind for tensor, kind in self._kinds)
 
     def synchronize(self) -> bool:
         """Take over what was loaded or moved since the last update; return whether anything was."""
+        if all(part.is_bound() for part in self.parts):
+            return False
+        for part in self.parts:
+            part.bind()
+        return True
 
     def release(self) -> None:
         """Give modules and optimizers memory of their own, until :meth:`synchronize`."""
+        for part in self.parts:
+            part.release()
 
 
-BoundT = TypeVar("BoundT", bound=Bound)
+def _kind(tensor: th.Tensor) -> object:
+    return tensor.requires_grad, tensor.dtype, tensor.device
 
 
-class EngineRuntime(Generic[BoundT]):
+def why_network_unsupported(network: Any) -> str | None:
+    """Return what about a network and its optimizer no engine supports, None if nothing."""
+    for module in network.modules():
+        if isinstance(module, _MODE_DEPENDENT):
+            return f"layer of type {type(module).__name__}"
+    for parameter in network.parameters():
+        if not parameter.requires_grad or parameter._backward_hooks:
+            return "parameters that are frozen or have hooks"
+    return why_optimizer_unsupported(network.optimizer, network)
+
+
+EngineT = TypeVar("EngineT", bound=BoundEngine)
+
+
+class EngineRuntime(Generic[EngineT]):
     """The engine of models that learn together.
 
     Between :meth:`running` and its end the models' parameters and optimizer states are views of the
@@ -41,37 +104,24 @@ class EngineRuntime(Generic[BoundT]):
     Args:
         models: Models that differ only in weights, data and random numbers. Their attribute
             ``compile`` says whether to compile.
-        why_unsupported: Returns what about a model the engine does not support, if anything.
-        build: Makes an engine of the models; the second argument is whether to compile.
+        engine_class: Class of the engine.
         refuse: Called with a reason when the engine does not support the models.
     """
 
     def __init__(
-        self,
-        models: Sequence[Any],
-        why_unsupported: Callable[[Any], str | None],
-        build: Callable[[Sequence[Any], bool], BoundT],
-        refuse: Callable[[str], None],
+        self, models: Sequence[Any], engine_class: type[EngineT], refuse: Callable[[str], None]
     ) -> None:
         self.models = models
-        self._why_unsupported, self._build = why_unsupported, build
+        #: Whether the models may be bound.
+        self.is_running = False
+        #: Whether callbacks may change the models.
+        self.is_watched = True
+        self._class, self._refuse = engine_class, refuse
         # Number of updates of the models before their first call of ``learn``, and after this one.
         self._first: int | None = None
         self._last = 0.0
-        self._refuse = refuse
-        self._engine: BoundT | None = None
-        self._running = self._checked = self._refused = False
-        self._watched = True
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the models may be bound."""
-        return self._running
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether callbacks may change the models."""
-        return self._watched
+        self._engine: EngineT | None = None
+        self._checked = self._refused = False
 
     @property
     def compiles(self) -> bool:
@@ -83,12 +133,7 @@ class EngineRuntime(Generic[BoundT]):
         return self._last - (self._first or 0) >= UPDATES_WORTH_COMPILING
 
     def plan(self, done: int, updates: float) -> None:
-        """Note that a call of ``learn`` begins.
-
-        Args:
-            done: Number of updates that the models have done.
-            updates: Number of updates that it is going to do.
-        """
+        """Note that a call of ``learn`` begins, after so many updates and with so many to come."""
         self._first = done if self._first is None else self._first
         self._last = done + updates
 
@@ -102,49 +147,48 @@ class EngineRuntime(Generic[BoundT]):
         Args:
             watched: Whether callbacks may change the models meanwhile.
         """
-        if self._running:
+        if self.is_running:
             yield
             return
         first = self.models[0]
         size = sum(parameter.numel() for parameter in first.policy.parameters())
-        self._running, self._watched = True, watched
+        self.is_running, self.is_watched = True, watched
         self._checked = self._refused = False
         try:
             with threads_for(size * first.batch_size), flushed_subnormals():
                 yield
         finally:
-            self._running = False
+            self.is_running = False
             if self._engine is not None:
                 self._engine.release()
 
-    def engine(self) -> BoundT | None:
+    def engine(self) -> EngineT | None:
         """Return the engine, bound to the models as they are now; None if it does not support them.
 
         To be called within :meth:`running`.
         """
-        if self._checked and not self._watched:
+        if self._checked and not self.is_watched:
             return self._engine
         self._checked = True
         if self._refused:
             return None
-        engine = self._engine
-        if engine is not None:
+        if self._engine is not None:
             # What was compiled once is kept: eager updates would be slower.
-            same = (engine.compiled or not self.compiles) and engine.fits(self.models)
-            if same and not engine.synchronize():
-                return engine
+            same = (self._engine.compiled or not self.compiles) and self._engine.fits()
+            if same and not self._engine.synchronize():
+                return self._engine
             if not same:
-                self.drop()
-        reason = self._why_unsupported(self.models[0])
+                self._drop()
+        reason = self._class.why_unsupported(self.models[0])
         if reason is not None:
-            self.drop()
+            self._drop()
             self._refused = True
             self._refuse(reason)
         elif self._engine is None:
-            self._engine = self._build(self.models, self.compiles)
+            self._engine = self._class(self.models, self.compiles)
         return self._engine
 
-    def drop(self) -> None:
+    def _drop(self) -> None:
         """Discard the engine: the models keep their values in memory of their own."""
         if self._engine is not None:
             self._engine.release()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
 from torch import nn
+from torch.utils._pytree import tree_map_only
 
 from sb3_flowpolicy.engine.adam import AdamSettings, adam_step
 from sb3_flowpolicy.engine.networks import StackedNetworks
@@ -21,10 +22,6 @@ class Moments(NamedTuple):
     mean: th.Tensor
     square: th.Tensor
     step: th.Tensor
-
-    def of(self, seeds: slice) -> Moments:
-        """Return some seeds' part, as views."""
-        return Moments(*(tensor[seeds] for tensor in self))
 
 
 class TrainState(NamedTuple):
@@ -40,15 +37,7 @@ class TrainState(NamedTuple):
 
     def of(self, seeds: slice) -> TrainState:
         """Return some seeds' part, as views."""
-        return TrainState(
-            self.actor[seeds],
-            self.critic[seeds],
-            tuple(tensor[seeds] for tensor in self.others),
-            self.ent_coef[seeds],
-            self.actor_moments.of(seeds),
-            self.critic_moments.of(seeds),
-            None if self.ent_coef_moments is None else self.ent_coef_moments.of(seeds),
-        )
+        return tree_map_only(th.Tensor, lambda tensor: tensor[seeds], self)
 
 
 class Batch(NamedTuple):
@@ -166,9 +155,7 @@ def step_entropy_coefficient(
     # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
     surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
     loss = -(state.ent_coef * surplus)
-    stepped = adam_step(state.ent_coef, -surplus, *moments, learning_rate, settings.ent_coef_adam)
-    for old, new in zip((state.ent_coef, *moments), stepped, strict=True):
-        old.copy_(new)
+    step(state.ent_coef, -surplus, moments, learning_rate, settings.ent_coef_adam)
     return loss
 
 
@@ -177,6 +164,34 @@ def bellman_targets(batch: Batch, next_values: th.Tensor, entropy: th.Tensor) ->
     discounts = (1 - batch.dones) * batch.discounts
     next_values = next_values - entropy.unsqueeze(-1)
     return batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
+
+
+def step(
+    parameters: th.Tensor,
+    gradient: th.Tensor,
+    moments: Moments,
+    learning_rate: th.Tensor,
+    settings: AdamSettings,
+) -> None:
+    """Take a step of Adam in place."""
+    stepped = adam_step(parameters, gradient, *moments, learning_rate, settings)
+    write((parameters, *moments), stepped)
+
+
+def write(olds: Iterable[th.Tensor], news: Iterable[th.Tensor]) -> None:
+    """Overwrite tensors in place."""
+    for old, new in zip(olds, news, strict=True):
+        old.copy_(new)
+
+
+def gradient_of(loss: th.Tensor, leaf: th.Tensor) -> th.Tensor:
+    """Differentiate losses (S,). As seeds share no parameters, that of the sum is each one's."""
+    return th.autograd.grad(loss.sum(), leaf)[0]
+
+
+def stack_losses(*losses: th.Tensor) -> th.Tensor:
+    """Return the losses (S,) or (S, 1), in the order of ``LOSSES``, as (4, S)."""
+    return th.stack([loss.detach().flatten() for loss in losses])
 
 
 def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
@@ -226,30 +241,16 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         critic = state.critic.detach().requires_grad_()
         outputs = networks.q_values(critic, batch.obs, batch.actions)
         critic_loss = objective.critic_loss(outputs, targets)
-        # Seeds do not share parameters: the gradient of the sum is each seed's own.
-        (gradient,) = th.autograd.grad(critic_loss.sum(), critic)
-        new_critic, *critic_moments = adam_step(
-            state.critic, gradient, *state.critic_moments, learning_rates[1], settings.critic_adam
-        )
+        gradient, moments = gradient_of(critic_loss, critic), state.critic_moments
+        step(state.critic, gradient, moments, learning_rates[1], settings.critic_adam)
 
-        outputs = networks.q_values(new_critic, batch.obs, actions_pi)
+        outputs = networks.q_values(state.critic, batch.obs, actions_pi)
         actor_loss = (ent_coef * log_prob - objective.actor_values(outputs)).mean(-1)
-        (gradient,) = th.autograd.grad(actor_loss.sum(), actor)
-        new_actor, *actor_moments = adam_step(
-            state.actor, gradient, *state.actor_moments, learning_rates[0], settings.actor_adam
-        )
+        gradient, moments = gradient_of(actor_loss, actor), state.actor_moments
+        step(state.actor, gradient, moments, learning_rates[0], settings.actor_adam)
 
         if move_target:
-            target.lerp_(new_critic, settings.tau)
-        state.critic.copy_(new_critic)
-        state.actor.copy_(new_actor)
-        for olds, news in (
-            (state.critic_moments, critic_moments),
-            (state.actor_moments, actor_moments),
-        ):
-            for old, new in zip(olds, news, strict=True):
-                old.copy_(new)
-        losses = ent_coef.squeeze(-1), ent_coef_loss.squeeze(-1), critic_loss, actor_loss
-        return th.stack([loss.detach() for loss in losses])
+            target.lerp_(state.critic, settings.tau)
+        return stack_losses(ent_coef, ent_coef_loss, critic_loss, actor_loss)
 
     return update

@@ -18,13 +18,7 @@ from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_c
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.common.vec_env import info_of
-from sb3_flowpolicy.engine import (
-    LOSSES,
-    EngineRuntime,
-    build_engine,
-    settings_key,
-    why_unsupported,
-)
+from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, settings_key
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.episodes import SeedEpisodes
 from sb3_flowpolicy.seeds.experience import SeedExperience
@@ -108,7 +102,7 @@ class SeedBatch:
         self.seeds = [int(name.removeprefix("seed_")) for name in agents]
         self._agents, self._models = agents, list(agents.values())
         check_stackable(self._models[0])
-        self._runtime = EngineRuntime(self._models, why_unsupported, build_engine, refuse)
+        self._runtime = EngineRuntime(self._models, Engine, refuse)
         self._checkpoints = RunCheckpoints(self._describe_run)
         self._losses: list[list[float]] | None = None
         self._logged: Sequence[str] = LOSSES

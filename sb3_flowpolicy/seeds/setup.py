@@ -16,7 +16,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
-from sb3_flowpolicy.engine import why_unsupported
+from sb3_flowpolicy.engine import Engine
 from sb3_flowpolicy.engine.replay import is_plain
 
 EnvFactory = Callable[[], gym.Env]
@@ -51,7 +51,8 @@ def copy_callback(
 
 def check_stackable(model: EngineFlow) -> None:
     """Raise ``ValueError`` if agents like this one cannot be trained in lockstep."""
-    reason, frequency, buffer = why_unsupported(model), model.train_freq, model.replay_buffer
+    reason, frequency = Engine.why_unsupported(model), model.train_freq
+    buffer = model.replay_buffer
     assert isinstance(frequency, TrainFreq)
     assert buffer is not None
     if isinstance(model.observation_space, gym.spaces.Dict):

@@ -17,7 +17,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import NonFiniteError, SACFlow
-from sb3_flowpolicy.algorithms.off_policy import SETTINGS, OffPolicyFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.common.validation import number
 from tests.checkpoint.test_resume import BreakAt, BrokenError
 from tests.guard.test_guard import Faulty
@@ -44,11 +44,11 @@ class CautiousSAC(SAC):
         super().train(gradient_steps, max(2, round(self.caution * batch_size)))
 
 
-class CautiousSACFlow(OffPolicyFlow, CautiousSAC):
+class CautiousSACFlow(EngineFlow, CautiousSAC):
     stock = CautiousSAC
     policy_class_of_stock = SACPolicy
     policy_aliases = SACFlow.policy_aliases
-    settings: ClassVar = {**SETTINGS, "caution": number(0, 1)}
+    settings: ClassVar = {**EngineFlow.settings, "caution": number(0, 1)}
 
 
 def test_it_resumes_bit_for_bit_with_colored_noise(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, FlowActorCriticPolicy, FlowPolicy, PPOFlow, SACFlow, TQCFlow
-from sb3_flowpolicy.algorithms.off_policy import OffPolicyFlow
 from sb3_flowpolicy.diagnostics import PolicyDiagnosticsCallback
 from tests.checkpoint.test_resume import BreakAt, BrokenError
 
@@ -45,18 +44,6 @@ def test_a_broken_run_goes_on_bit_for_bit(algorithm: Any, tmp_path: Path) -> Non
     assert expected.keys() == found.keys()
     assert not [name for name, value in expected.items() if not th.equal(value, found[name])]
     np.testing.assert_array_equal(calm.replay_buffer.actions, resumed.replay_buffer.actions)
-
-
-@OFF_POLICY
-def test_checkpoints_without_an_engine_can_be_resumed(
-    algorithm: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They were written before these algorithms ran on it."""
-    with monkeypatch.context() as patch:
-        patch.setattr(algorithm, "_stateful_parts", OffPolicyFlow._stateful_parts)
-        make(algorithm).learn(60, checkpoint_every=40, checkpoint_path=tmp_path)
-    resumed = algorithm.resume(tmp_path, ENV, device="cpu").learn(60)
-    assert resumed.num_timesteps == 60
 
 
 @OFF_POLICY

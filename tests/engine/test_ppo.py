@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import PPOFlow
-from sb3_flowpolicy.engine.ppo_engine import PPOEngine, why_ppo_unsupported
+from sb3_flowpolicy.engine.ppo_engine import PPOEngine
 
 # 150 steps leave a minibatch of 22 at the end of each epoch.
 SMALL: dict[str, Any] = {"n_steps": 150, "batch_size": 64, "n_epochs": 2, "seed": 0}
@@ -61,7 +61,7 @@ def trained(model: PPOFlow, engine: bool | None) -> tuple[dict[str, th.Tensor], 
     if engine is None:
         PPO.train(model)
     else:
-        bound = PPOEngine(model, compiled=engine)
+        bound = PPOEngine([model], compiled=engine)
         model._train_with(bound)
         bound.release()
     logged = {k: v for k, v in model.logger.name_to_value.items() if k.startswith("train/")}
@@ -102,7 +102,7 @@ def test_compiled_equals_eager() -> None:
 
 def test_acting_equals_the_policys_own() -> None:
     model = collected("FlowPolicy", th.float32, {})
-    engine, obs = PPOEngine(model, compiled=False), th.randn(3, 42)
+    engine, obs = PPOEngine([model], compiled=False), th.randn(3, 42)
     th.manual_seed(2)
     expected = model.policy(obs)
     with engine.collecting():
@@ -116,7 +116,7 @@ def test_acting_equals_the_policys_own() -> None:
 def test_acting_follows_what_callbacks_do_to_the_policy(what: str) -> None:
     model = collected("FlowPolicy", th.float32, {})
     policy, obs = model.policy, th.randn(3, 42)
-    engine = PPOEngine(model, compiled=False)
+    engine = PPOEngine([model], compiled=False)
     state = {name: value + 0.1 for name, value in policy.state_dict().items()}
     with engine.collecting():
         if what == "moved":
@@ -132,7 +132,7 @@ def test_acting_follows_what_callbacks_do_to_the_policy(what: str) -> None:
     th.manual_seed(2)
     expected = policy(obs)
     th.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    assert engine.fits([model]) == (what in ("loaded", "shifted"))
+    assert engine.fits() == (what in ("loaded", "shifted"))
 
 
 def test_a_minibatch_with_a_log_probability_that_is_not_finite_changes_nothing() -> None:
@@ -160,7 +160,7 @@ def test_the_engine_steps_aside_for_what_it_does_not_support() -> None:
         UserWarning, match="does not support parameters that are frozen or have hooks"
     ):
         model.learn(300, callback=_FreezeOnce())
-    assert why_ppo_unsupported(model) == "parameters that are frozen or have hooks"
+    assert PPOEngine.why_unsupported(model) == "parameters that are frozen or have hooks"
     assert model._runtime._engine is None
     assert model._n_updates == 6
 
