@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_flowpolicy.experiments.curves import running_mean, swings
 from sb3_flowpolicy.experiments.experiment import (
     NOT_MEASURED,
     NOT_REPRODUCED,
@@ -43,6 +42,9 @@ SWINGS_OF_AN_OSCILLATION = 3
 class Evidence:
     """Results of one experiment.
 
+    Curves are data frames with a row per step and a column per seed; what is said of each seed is
+    an array (S,).
+
     Args:
         experiment: The experiment.
         folder: Its folder, complete or not.
@@ -61,9 +63,8 @@ class Evidence:
         self.experiment, self.folder, self.others = experiment, folder, others
         self.settings = read_settings(folder) or {}
         self.items: dict[str, dict[str, Any]] = self.settings.get("items", {})
-        self.files = {key: ItemFiles(folder, key) for key in self.items}
         self.done = {
-            key: self.files[key].read_done(item["steps"], item["seeds"])
+            key: ItemFiles(folder, key).read_done(item["steps"], item["seeds"])
             for key, item in self.items.items()
         }
 
@@ -91,37 +92,19 @@ class Evidence:
         """Whether all agents have finished on all settings."""
         there = {(item["setting"], item["agent"]) for item in self.items.values()}
         wanted = {
-            (setting.name, agent.name)
-            for setting in self.experiment.settings
-            for agent in self.experiment.agents
+            (s.name, a.name) for s in self.experiment.settings for a in self.experiment.agents
         }
         return wanted <= there and all(self.done.values())
 
-    @property
-    def seeds(self) -> list[int]:
-        """All seeds of the run."""
-        return self.settings.get("seeds", [])
-
     @cached_property
     def _logs(self) -> dict[tuple[str, str], pd.DataFrame]:
-        logs: dict[tuple[str, str], list[pd.DataFrame]] = {}
+        tables = {key: ItemFiles(self.folder, key).read_table() for key in self.items}
+        logs: dict[tuple[str, str], pd.DataFrame] = {}
         for key, item in self.items.items():
-            table = self.files[key].read_table()
-            if not table.empty:
-                logs.setdefault((item["setting"], item["agent"]), []).append(table)
-        return {pair: pd.concat(tables) for pair, tables in logs.items()}
-
-    @cached_property
-    def _details(self) -> dict[tuple[str, str], list[dict[str, Any]]]:
-        details: dict[tuple[str, str], list[dict[str, Any]]] = {}
-        for key, item in self.items.items():
-            found = details.setdefault((item["setting"], item["agent"]), [])
-            found += self.files[key].read_details()
-        return details
-
-    def has(self, setting: str, agent: str) -> bool:
-        """Whether there is anything of this agent on this setting."""
-        return (setting, agent) in self._logs
+            if not tables[key].empty:
+                pair = item["setting"], item["agent"]
+                logs[pair] = pd.concat([logs.get(pair), tables[key]])
+        return logs
 
     @property
     def measured(self) -> list[tuple[Setting, Agent]]:
@@ -130,23 +113,21 @@ class Evidence:
             (setting, agent)
             for setting in self.experiment.settings
             for agent in self.experiment.agents
-            if self.has(setting.name, agent.name)
+            if (setting.name, agent.name) in self._logs
         ]
 
     def columns(self, setting: str, agent: str) -> list[str]:
         """Return the metrics that were measured for every seed of this agent."""
-        if not self.has(setting, agent):
+        if (setting, agent) not in self._logs:
             return []
         counts = self._logs[setting, agent].groupby("seed").count()
         return [name for name in counts if counts[name].all() and name not in BASIC_COLUMNS[:3]]
 
-    def curves(self, setting: str, agent: str, metric: str) -> tuple[np.ndarray, np.ndarray]:
+    def curves(self, setting: str, agent: str, metric: str) -> pd.DataFrame:
         """Return a metric of all seeds on a common grid: all steps at which any was measured.
 
-        Between measurements it is linear, before the first constant.
-
-        Returns:
-            Steps (T,) and values (S, T); the grid ends where the shortest log does.
+        Between measurements it is linear, before the first constant. The grid ends where the
+        shortest log does.
 
         Raises:
             NotMeasuredError: If it was not measured.
@@ -156,37 +137,32 @@ class Evidence:
         log = self._logs[setting, agent]
         end = log.groupby("seed")["step"].max().min()
         curves = log.pivot(index="step", columns="seed", values=metric)
-        curves = curves.interpolate(method="index").bfill().loc[:end]
-        # A copy has its seeds in rows, so that sums over steps keep their order and last digit.
-        return curves.index.to_numpy(), curves.to_numpy().T.copy()
+        return curves.interpolate(method="index").bfill().loc[:end]
 
     def final(self, setting: str, agent: str, metric: str) -> np.ndarray:
         """Return each seed's mean over the last tenth of its evaluations, (S,)."""
-        _, values = self.curves(setting, agent, metric)
-        return values[:, -max(FINAL_LEAST, round(FINAL_SHARE * values.shape[1])) :].mean(1)
-
-    def best(self, setting: str, agent: str, metric: str) -> np.ndarray:
-        """Return each seed's best mean over three evaluations in a row, (S,)."""
-        _, values = self.curves(setting, agent, metric)
-        return running_mean(values, IN_A_ROW)[:, IN_A_ROW - 1 :].max(1, initial=-np.inf)
+        curves = self.curves(setting, agent, metric)
+        return curves.tail(max(FINAL_LEAST, round(FINAL_SHARE * len(curves)))).mean().to_numpy()
 
     def solved(self, setting: str, agent: str) -> np.ndarray:
         """Return which seeds succeed at the end, (S,)."""
         return self.final(setting, agent, "test_success") >= SOLVED - _ROUNDING
 
+    def _solved_at(self, setting: str, agent: str) -> pd.DataFrame:
+        """Return whether the last evaluations in a row succeed, by step and seed."""
+        success = self.curves(setting, agent, "test_success")
+        return success.rolling(IN_A_ROW).mean() >= SOLVED - _ROUNDING
+
     def solved_once(self, setting: str, agent: str) -> np.ndarray:
         """Return which seeds succeed at their best, (S,)."""
-        return self.best(setting, agent, "test_success") >= SOLVED - _ROUNDING
+        return self._solved_at(setting, agent).any().to_numpy()
 
     def steps_until_solved(self, setting: str, agent: str) -> np.ndarray:
         """Return the step at which each seed first succeeds in a row of evaluations, (S,).
 
         Seeds that never do count with the length of training, a lower bound.
         """
-        steps, values = self.curves(setting, agent, "test_success")
-        reached = running_mean(values, IN_A_ROW) >= SOLVED - _ROUNDING
-        reached[:, : IN_A_ROW - 1] = False
-        return np.where(reached.any(1), steps[reached.argmax(1)], steps[-1])
+        return _first(self._solved_at(setting, agent)).to_numpy()
 
     def oscillations(self, setting: str, agent: str) -> np.ndarray:
         """Return the number of swings of each seed, the least over the three curves, (S,).
@@ -195,38 +171,28 @@ class Evidence:
         of the entropy coefficient, each averaged over three evaluations. In the thesis all three
         swing together, so the curve with the fewest swings decides.
         """
-        _, success = self.curves(setting, agent, "train_success")
+        starts = _first(self.curves(setting, agent, "train_success") > 0)
+        rivals = [other.name for one, other in self.measured if one.name == setting]
+        best_return = max(self.curves(setting, one, "test_return").max(axis=None) for one in rivals)
         counts = []
-        amplitudes = {**OSCILLATIONS}
-        amplitudes["train_return"] *= self._best_test_return(setting)
-        for metric, amplitude in amplitudes.items():
-            _, values = self.curves(setting, agent, metric.removeprefix("log_"))
-            curves = np.log(values) if metric.startswith("log_") else values
-            smooth = running_mean(curves, IN_A_ROW)
-            counts.append(
-                [
-                    swings(curve[start:], amplitude)
-                    for curve, start in zip(smooth, _first(success > 0), strict=True)
-                ]
-            )
+        for metric, amplitude in OSCILLATIONS.items():
+            curves = self.curves(setting, agent, metric.removeprefix("log_"))
+            curves = np.log(curves) if metric.startswith("log_") else curves
+            smooth = curves.rolling(IN_A_ROW, min_periods=1).mean()
+            size = amplitude * (best_return if metric == "train_return" else 1.0)
+            counts.append([swings(smooth.loc[starts[s] :, s].to_numpy(), size) for s in smooth])
         return np.min(counts, axis=0)
 
     def succeeded(self, setting: str, agent: str) -> np.ndarray:
         """Return which seeds ever succeeded in training, (S,)."""
-        _, success = self.curves(setting, agent, "train_success")
-        return np.any(success > 0, axis=1)
+        return (self.curves(setting, agent, "train_success") > 0).any().to_numpy()
 
-    def _best_test_return(self, setting: str) -> float:
-        """Return the highest test return of any agent, the unit of swings in return."""
-        agents = [agent.name for one, agent in self.measured if one.name == setting]
-        return max(float(self.curves(setting, one, "test_return")[1].max()) for one in agents)
-
-    def profile(self, setting: str, agent: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return shares of the way (K,) and the entropy there (S, K) at the end of training."""
-        found = self._kind("profile", setting, agent)
+    def profile(self, setting: str, agent: str) -> pd.DataFrame | None:
+        """Return the entropy at the end of training by share of the way (rows) and seed."""
+        found = self._details("profile", setting, agent)
         if not found:
             return None
-        return np.array(found[0]["way"]), np.array([one["entropy"] for one in found])
+        return pd.DataFrame({one["seed"]: one["entropy"] for one in found}, found[0]["way"])
 
     def front_loading(self, setting: str, agent: str) -> np.ndarray:
         """Return each seed's entropy at the start less the mean along the way, (S,).
@@ -236,17 +202,50 @@ class Evidence:
         profile = self.profile(setting, agent)
         if profile is None:
             raise NotMeasuredError(f"profile of {agent} on {setting}")
-        entropy = profile[1]
-        return entropy[:, 0] - entropy.mean(1)
+        return (profile.iloc[0] - profile.mean()).to_numpy()
 
     def pictures(self, setting: str, agent: str) -> list[dict[str, Any]]:
         """Return the recorded policies, in order of steps."""
-        return sorted(self._kind("picture", setting, agent), key=lambda one: one["step"])
+        return sorted(self._details("picture", setting, agent), key=lambda one: one["step"])
 
-    def _kind(self, kind: str, setting: str, agent: str) -> list[dict[str, Any]]:
-        return [one for one in self._details.get((setting, agent), []) if one["kind"] == kind]
+    def _details(self, kind: str, setting: str, agent: str) -> list[dict[str, Any]]:
+        return [
+            detail
+            for key, item in self.items.items()
+            if (item["setting"], item["agent"]) == (setting, agent)
+            for detail in ItemFiles(self.folder, key).read_details()
+            if detail["kind"] == kind
+        ]
 
 
-def _first(flags: np.ndarray) -> np.ndarray:
-    """Return the index of each row's first True, the length of the row if there is none."""
-    return np.where(flags.any(1), flags.argmax(1), flags.shape[1] - 1)
+def swings(values: np.ndarray, amplitude: float) -> int:
+    """Count how often a curve turns round after moving at least ``amplitude`` one way.
+
+    Small wiggles do not count. A monotonic curve has none, a square wave over three periods five.
+
+    Args:
+        values: The curve, (T,).
+        amplitude: Least difference between a high and the low that follows, above 0.
+
+    Example:
+        >>> swings(np.array([0.0, 1.0, 0.1, 0.2, 0.9, 0.0]), 0.5)
+        3
+        >>> swings(np.linspace(0, 9, 50), 1.5)
+        0
+    """
+    low = high = values[0]
+    direction, turns = 0, 0
+    for value in values[1:]:
+        low, high = min(low, value), max(high, value)
+        if direction >= 0 and high - value >= amplitude:
+            turns += direction
+            direction, low = -1, value
+        elif direction <= 0 and value - low >= amplitude:
+            turns -= direction
+            direction, high = 1, value
+    return turns
+
+
+def _first(flags: pd.DataFrame) -> pd.Series:
+    """Return the index of each column's first True, the last index if there is none."""
+    return flags.idxmax().where(flags.any(), flags.index[-1])

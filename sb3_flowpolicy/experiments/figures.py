@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap
 
 from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean, interquartile_mean
 from sb3_flowpolicy.diagnostics.figures import new_figure
-from sb3_flowpolicy.experiments.curves import running_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
 from sb3_flowpolicy.experiments.tables import WORDS
@@ -33,8 +34,6 @@ COLORS = {
     "spline": "#6a3d9a",
     "spline-pink": "#cab2d6",
 }
-# Color of a field whose seeds all succeed; white if none does.
-_FULL = COLORS["flow"]
 # Fields above this share are so dark that their text has to be white.
 _DARK = 0.6
 PANELS = ("train_return", "test_return", "test_success", "entropy", "ent_coef")
@@ -49,18 +48,15 @@ def color(agent: Agent) -> str:
 
 def panels(evidence: Evidence) -> list[str]:
     """Return the metrics to draw: those measured, and the entropy coefficient if learned."""
-    columns = {
-        (setting.name, agent.name): evidence.columns(setting.name, agent.name)
-        for setting, agent in evidence.measured
-    }
-    names = {name for measured in columns.values() for name in measured}
-    coefficients = [
-        evidence.curves(*pair, "ent_coef")[1] for pair in columns if "ent_coef" in columns[pair]
-    ]
-    if not any(np.ptp(curves) > 0 for curves in coefficients):
+    measured = {(s.name, a.name): evidence.columns(s.name, a.name) for s, a in evidence.measured}
+    names = {name for columns in measured.values() for name in columns} - {"train_success"}
+    if not any(
+        np.ptp(evidence.curves(*pair, "ent_coef")) > 0
+        for pair, columns in measured.items()
+        if "ent_coef" in columns
+    ):
         names.discard("ent_coef")
-    extra = sorted(names - set(PANELS) - {"train_success"})
-    return [name for name in (*PANELS, *extra) if name in names]
+    return [name for name in (*PANELS, *sorted(names - set(PANELS))) if name in names]
 
 
 def curves_figure(evidence: Evidence) -> Figure:
@@ -69,23 +65,26 @@ def curves_figure(evidence: Evidence) -> Figure:
     Every seed is a thin line, their interquartile mean a bold one, its 95 % interval a band.
     """
     experiment, metrics = evidence.experiment, panels(evidence)
-    rows = len(experiment.settings)
-    figure = new_figure(3.3 * len(metrics), 2.5 * rows + 0.4)
-    grid = figure.subplots(rows, len(metrics), squeeze=False)
-    for k, (row, setting) in enumerate(zip(grid, experiment.settings, strict=True)):
+    figure = new_figure(3.3 * len(metrics), 2.5 * len(experiment.settings) + 0.4)
+    grid = figure.subplots(len(experiment.settings), len(metrics), squeeze=False)
+    for row, setting in zip(grid, experiment.settings, strict=True):
         for axes, metric in zip(row, metrics, strict=True):
             for agent in experiment.agents:
                 if metric in evidence.columns(setting.name, agent.name):
-                    steps, values = evidence.curves(setting.name, agent.name, metric)
-                    _draw(axes, agent, steps, smoothed(values))
+                    curves = evidence.curves(setting.name, agent.name, metric)
+                    draw_seeds(axes, smoothed(curves), color(agent), agent.label)
             _style(axes)
-            _scale(axes, metric)
-            if k == rows - 1:
-                axes.set_xlabel("environment steps", fontsize=8)
-            if k == 0:
-                axes.set_title(WORDS.get(metric, metric), fontsize=10)
-        if rows > 1:
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x else "0")
+            axes.set_xlim(left=0)
+            if metric.endswith("success"):
+                axes.set_ylim(-0.03, 1.03)
+            if metric == "ent_coef":
+                axes.set_yscale("log")
+        if len(grid) > 1:
             row[0].set_ylabel(setting.name, fontsize=10)
+    for above, below, metric in zip(grid[0], grid[-1], metrics, strict=True):
+        above.set_title(WORDS.get(metric, metric), fontsize=10)
+        below.set_xlabel("environment steps", fontsize=8)
     handles = {
         label: handle
         for axes in grid.flat
@@ -97,17 +96,17 @@ def curves_figure(evidence: Evidence) -> Figure:
     return figure
 
 
-def smoothed(values: np.ndarray) -> np.ndarray:
+def smoothed(curves: pd.DataFrame) -> pd.DataFrame:
     """Average over evaluations as drawn."""
-    return running_mean(values, SMOOTHED_OVER)
+    return curves.rolling(SMOOTHED_OVER, min_periods=1).mean()
 
 
-def _draw(axes: Axes, agent: Agent, x: np.ndarray, values: np.ndarray) -> None:
-    """Draw seeds (S, T) thin, their interquartile mean bold, its interval as a band."""
-    shade, mean = color(agent), bootstrap_interquartile_mean(values)
-    axes.plot(x, values.T, color=shade, linewidth=0.5, alpha=0.35)
-    axes.fill_between(x, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
-    axes.plot(x, mean.value, color=shade, linewidth=2, label=agent.label)
+def draw_seeds(axes: Axes, curves: pd.DataFrame, shade: str, label: str) -> None:
+    """Draw each column thin, their interquartile mean bold, its 95 % interval as a band."""
+    mean = bootstrap_interquartile_mean(curves.to_numpy().T)
+    axes.plot(curves.index, curves, color=shade, linewidth=0.5, alpha=0.35)
+    axes.fill_between(curves.index, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
+    axes.plot(curves.index, mean.value, color=shade, linewidth=2, label=label)
 
 
 def _style(axes: Axes) -> None:
@@ -116,32 +115,21 @@ def _style(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _scale(axes: Axes, metric: str) -> None:
-    axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x else "0")
-    axes.set_xlim(left=0)
-    if metric.endswith("success"):
-        axes.set_ylim(-0.03, 1.03)
-    if metric == "ent_coef":
-        axes.set_yscale("log")
-
-
 def profile_figure(evidence: Evidence) -> Figure | None:
     """Draw the entropy along the way to the goal at the end of training (thesis Fig. 3.8)."""
-    settings = [
-        setting
-        for setting in evidence.experiment.settings
-        if any(evidence.profile(setting.name, a.name) for a in evidence.experiment.agents)
-    ]
-    if not settings:
+    experiment = evidence.experiment
+    found: dict[str, list[tuple[Agent, pd.DataFrame]]] = {}
+    for setting, agent in itertools.product(experiment.settings, experiment.agents):
+        profile = evidence.profile(setting.name, agent.name)
+        if profile is not None:
+            found.setdefault(setting.name, []).append((agent, profile))
+    if not found:
         return None
-    figure = new_figure(6.5, 3.0 * len(settings))
-    for axes, setting in zip(
-        figure.subplots(len(settings), 1, squeeze=False)[:, 0], settings, strict=True
-    ):
-        for agent in evidence.experiment.agents:
-            profile = evidence.profile(setting.name, agent.name)
-            if profile is not None:
-                _draw(axes, agent, *profile)
+    figure = new_figure(6.5, 3.0 * len(found))
+    column = figure.subplots(len(found), 1, squeeze=False)[:, 0]
+    for axes, profiles in zip(column, found.values(), strict=True):
+        for agent, profile in profiles:
+            draw_seeds(axes, profile, color(agent), agent.label)
         axes.set_xlabel("share of the way from start to goal, on the centre line", fontsize=8)
         axes.set_ylabel("entropy (nats)", fontsize=8)
         _style(axes)
@@ -164,24 +152,27 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
     axes = figure.subplots()
     shares = np.full((rows, columns), np.nan)
     for row, column in np.ndindex(rows, columns):
-        setting, agent = experiment.settings[column].name, experiment.agents[row].name
-        if "test_success" not in evidence.columns(setting, agent):
+        pair = experiment.settings[column].name, experiment.agents[row].name
+        if "test_success" not in evidence.columns(*pair):
             continue
-        solved = evidence.solved(setting, agent)
+        solved = evidence.solved(*pair)
         shares[row, column] = share = solved.mean()
         text = f"{solved.sum()} of {len(solved)}"
-        if evidence.solved_once(setting, agent).any():
-            steps = interquartile_mean(evidence.steps_until_solved(setting, agent))
+        if evidence.solved_once(*pair).any():
+            steps = interquartile_mean(evidence.steps_until_solved(*pair))
             text += f"\n{float(steps.value):,.0f} steps"
         shade = "white" if share > _DARK else "black"
-        axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=8, color=shade)
+        axes.text(column, row, text, ha="center", va="center", fontsize=8, color=shade)
     if np.isnan(shares).all():
         return None
-    white_to_blue = LinearSegmentedColormap.from_list("shares", ["white", _FULL])
-    axes.pcolormesh(shares, cmap=white_to_blue, vmin=0, vmax=1, edgecolors="white", linewidth=3)
+    white_to_blue = LinearSegmentedColormap.from_list("shares", ["white", COLORS["flow"]])
+    fields = np.arange(columns), np.arange(rows)  # their centers
+    axes.pcolormesh(
+        *fields, shares, cmap=white_to_blue, vmin=0, vmax=1, edgecolors="white", linewidth=3
+    )
     axes.invert_yaxis()
-    axes.set_xticks([k + 0.5 for k in range(columns)], [one.name for one in experiment.settings])
-    axes.set_yticks([k + 0.5 for k in range(rows)], [agent.label for agent in experiment.agents])
+    axes.set_xticks(range(columns), [one.name for one in experiment.settings])
+    axes.set_yticks(range(rows), [agent.label for agent in experiment.agents])
     axes.xaxis.tick_top()
     axes.tick_params(length=0, labelsize=8)
     axes.spines[:].set_visible(False)

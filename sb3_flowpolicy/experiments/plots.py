@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import plotly.graph_objects as go
 
 from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
@@ -19,8 +20,7 @@ def curves_plot(evidence: Evidence, setting: str, metric: str) -> go.Figure:
     figure = go.Figure()
     for agent in evidence.experiment.agents:
         if metric in evidence.columns(setting, agent.name):
-            steps, values = evidence.curves(setting, agent.name, metric)
-            _add(figure, agent, steps, smoothed(values))
+            _add(figure, agent, smoothed(evidence.curves(setting, agent.name, metric)))
     _dress(figure, WORDS.get(metric, metric), "environment steps")
     if metric == "ent_coef":
         figure.update_yaxes(type="log")
@@ -35,14 +35,15 @@ def profile_plot(evidence: Evidence, setting: str) -> go.Figure | None:
     for agent in evidence.experiment.agents:
         profile = evidence.profile(setting, agent.name)
         if profile is not None:
-            _add(figure, agent, *profile)
+            _add(figure, agent, profile)
     if not figure.data:
         return None
     _dress(figure, "entropy along the way, at the end", "share of the way from start to goal")
     return figure
 
 
-def _add(figure: go.Figure, agent: Agent, x: np.ndarray, values: np.ndarray) -> None:
+def _add(figure: go.Figure, agent: Agent, curves: pd.DataFrame) -> None:
+    x, values = curves.index.to_numpy(), curves.to_numpy().T
     shade, mean = color(agent), bootstrap_interquartile_mean(values)
     group: dict[str, Any] = {"name": agent.label, "legendgroup": agent.name, "mode": "lines"}
     silent = {**group, "hoverinfo": "skip", "showlegend": False}

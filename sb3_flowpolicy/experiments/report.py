@@ -8,10 +8,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
 from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.experiments.experiment import NOT_MEASURED
 from sb3_flowpolicy.experiments.section import METHOD, Section, png, read_results
-from sb3_flowpolicy.experiments.tables import Table
+from sb3_flowpolicy.experiments.tables import markdown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,58 +69,49 @@ def write_docs(results: Path, docs: Path) -> Path:
     data = docs / "experiments"
     data.mkdir(parents=True, exist_ok=True)
     sections = [Section(evidence) for evidence in read_results(results)]
-    overview = [
-        [one.experiment.claim, f"[`{name}`](#{name})", one.experiment.title, _verdict(one)]
-        for one in sections
-        for name in [one.experiment.name]
-    ]
-    table = Table(["claim", "experiment", "what it compares", "verdict"], overview)
-    parts = [_MARKDOWN_HEAD.format(method=METHOD), table.markdown() + "\n"]
+    overview = pd.DataFrame(
+        [
+            (one.claim, f"[`{one.name}`](#{one.name})", one.title, section.verdict_in_words)
+            for section in sections
+            for one in [section.experiment]
+        ],
+        columns=["claim", "experiment", "what it compares", "verdict"],
+    )
+    parts = [_MARKDOWN_HEAD.format(method=METHOD), markdown(overview) + "\n"]
     for section in sections:
-        images = {}
-        for name, figure in section.pictures().items():
-            images[name] = f"experiments/{section.experiment.name}-{name}.png"
-            (docs / images[name]).write_bytes(png(figure, dpi=80))
+        name, images = section.experiment.name, {}
+        for kind, figure in section.pictures().items():
+            images[kind] = f"experiments/{name}-{kind}.png"
+            (docs / images[kind]).write_bytes(png(figure, dpi=80))
         parts.append(_markdown(section, images))
         if section.measured and data.resolve() != results.resolve():
-            _copy_data(section.evidence.folder, data / section.experiment.name)
+            unwanted = shutil.ignore_patterns(".*", "agents", "checkpoints")
+            shutil.copytree(results / name, data / name, ignore=unwanted, dirs_exist_ok=True)
     page = docs / "experiments.md"
     write_text(page, "\n".join(parts))
     return page
 
 
-def _verdict(section: Section) -> str:
-    return section.verdict_in_words + (f" ({section.reservation})" if section.reservation else "")
-
-
 def _markdown(section: Section, images: dict[str, str]) -> str:
     experiment = section.experiment
-    lines = [f"## {experiment.name}", ""]
-    lines += [
+    paragraphs = [
+        f"## {experiment.name}",
         f"**{experiment.claim}, {experiment.source}.** {experiment.title}",
-        "",
         f"*Thesis:* {experiment.thesis}",
-        "",
+        experiment.notes,
     ]
-    if experiment.notes:
-        lines += [experiment.notes, ""]
     if section.table is None:
         needs = f"Needs {section.missing}. " if section.missing else ""
-        lines += [f"Not run yet. {needs}Estimated at {section.estimate} on two cores.", ""]
-        lines += [f"`{section.facts['command']}`", ""]
-        return "\n".join(lines)
-    lines += [f"**Verdict: {_verdict(section)}.**", ""]
-    rows = [[text, mark, finding.measured] for text, mark, finding in section.rule]
-    lines += [Table(["rule", "", "measured"], rows).markdown(), ""]
-    for name, path in images.items():
-        lines += [f"![{experiment.name}: {name}]({path})", ""]
-    lines += [section.table.markdown(), ""]
-    lines += [f"- {name}: {text}" for name, text in section.facts.items()]
-    return "\n".join([*lines, ""])
-
-
-def _copy_data(source: Path, target: Path) -> None:
-    target.mkdir(exist_ok=True)
-    for path in sorted(source.iterdir()):
-        if path.suffix in (".csv", ".json", ".jsonl"):
-            shutil.copyfile(path, target / path.name)
+        paragraphs += [
+            f"Not run yet. {needs}Estimated at {section.estimate} on two cores.",
+            f"`{section.facts['command']}`",
+        ]
+    else:
+        paragraphs += [
+            f"**Verdict: {section.verdict_in_words}.**",
+            markdown(section.rule),
+            *(f"![{experiment.name}: {kind}]({path})" for kind, path in images.items()),
+            markdown(section.table),
+            "\n".join(f"- {name}: {text}" for name, text in section.facts.items()),
+        ]
+    return "\n\n".join(filter(None, paragraphs)) + "\n"

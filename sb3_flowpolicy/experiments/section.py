@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
+
 from sb3_flowpolicy.common.statistics import RESAMPLES, RESAMPLES_OF_PAIRS
 from sb3_flowpolicy.experiments import evidence as definitions
 from sb3_flowpolicy.experiments.evidence import Evidence
@@ -17,7 +19,6 @@ from sb3_flowpolicy.experiments.experiment import (
     PARTLY,
     REPRODUCED,
     Experiment,
-    Finding,
 )
 from sb3_flowpolicy.experiments.figures import (
     SMOOTHED_OVER,
@@ -29,7 +30,7 @@ from sb3_flowpolicy.experiments.figures import (
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
 from sb3_flowpolicy.experiments.policy_pictures import policies_figure
 from sb3_flowpolicy.experiments.store import differences
-from sb3_flowpolicy.experiments.tables import Table, facts, results_table
+from sb3_flowpolicy.experiments.tables import facts, results_table
 from sb3_flowpolicy.experiments.work import FIRST_SEED, in_words, make_plan, plan_seconds
 
 if TYPE_CHECKING:
@@ -69,9 +70,9 @@ class Section:
 
     def __init__(self, evidence: Evidence) -> None:
         self.evidence, self.experiment = evidence, evidence.experiment
-        self.verdict, self.findings = evidence.judge()
+        self.verdict, findings = evidence.judge()
         self.measured = bool(evidence.measured)
-        self.table: Table | None = results_table(evidence) if self.measured else None
+        self.table = results_table(evidence) if self.measured else None
         self.facts = facts(evidence)
         self.missing = what_is_missing(self.experiment)
         self.estimate = in_words(plan_seconds(make_plan(self.experiment), 2))
@@ -79,21 +80,19 @@ class Section:
         self.reservation = (
             reservation(self.experiment, evidence.settings) if evidence.items else None
         )
+        marks = {True: "holds", False: "fails", None: "open"}
+        rule = [
+            (check.statement, marks[finding.holds], finding.measured)
+            for check, finding in zip(self.experiment.checks, findings, strict=True)
+        ]
+        self.rule = pd.DataFrame(rule, columns=["rule", "", "measured"])
 
     @property
     def verdict_in_words(self) -> str:
-        """The verdict in words; our own experiments have no claim to reproduce."""
+        """The verdict and its reservation; our own experiments have no claim to reproduce."""
         ours = self.experiment.source == "ours"
-        return _OURS_IN_WORDS.get(self.verdict, self.verdict) if ours else self.verdict
-
-    @property
-    def rule(self) -> list[tuple[str, str, Finding]]:
-        """Statements of the rule, each with a mark and the result."""
-        marks = {True: "holds", False: "fails", None: "open"}
-        return [
-            (check.statement, marks[finding.holds], finding)
-            for check, finding in zip(self.experiment.checks, self.findings, strict=True)
-        ]
+        verdict = _OURS_IN_WORDS.get(self.verdict, self.verdict) if ours else self.verdict
+        return verdict + (f" ({self.reservation})" if self.reservation else "")
 
     def plots(self) -> list[tuple[str, list[str]]]:
         """Return the interactive plots as JSON, grouped by setting."""

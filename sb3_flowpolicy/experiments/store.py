@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 import math
 import os
 import shutil
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +37,6 @@ BASIC_COLUMNS = (
     *("seed", "step", "episodes", "train_return", "train_success", "test_return"),
     *("test_success", "entropy", "ent_coef"),
 )
-Row = dict[str, float | None]
 
 # What the files hold, see common.files.require.
 _SETTINGS_FIELDS = {"schema": int, "experiment": str, "steps": int, "seeds": list, "items": dict}
@@ -101,12 +102,8 @@ def differences(found: Any, wanted: Any, where: str = "") -> list[str]:
                 found.get(key), wanted.get(key), f"{where}.{key}" if where else key
             )
         ]
-    return [] if found == wanted else [f"{where}: there {_short(found)}, now {_short(wanted)}"]
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    there, now = (textwrap.shorten(json.dumps(one), 60) for one in (found, wanted))
+    return [] if found == wanted else [f"{where}: there {there}, now {now}"]
 
 
 class ItemFiles:
@@ -132,12 +129,21 @@ class ItemFiles:
         return self.done.is_file()
 
     def append_rows(self, rows: Sequence[Mapping[str, float | None]]) -> None:
-        """Append one line per row, after the header in a new file."""
-        columns = list(rows[0])
-        lines = [",".join(_format(row[name]) for name in columns) for row in rows]
-        if not self.table.exists() or self.table.stat().st_size == 0:
-            lines.insert(0, ",".join(columns))
-        _append(self.table, "\n".join(lines) + "\n")
+        """Append one line per row, after the header in a new file.
+
+        Five digits are more than a curve shows; whole numbers stay whole, None is left empty.
+
+        Raises:
+            ValueError: If a number is not finite.
+        """
+        for name, value in itertools.chain.from_iterable(row.items() for row in rows):
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} must be finite, got {value}")
+        new = not self.table.exists() or self.table.stat().st_size == 0
+        lines = pd.DataFrame(rows).to_csv(
+            index=False, header=new, float_format="%.5g", lineterminator="\n"
+        )
+        _append(self.table, lines)
 
     def append_detail(self, detail: Mapping[str, Any]) -> None:
         """Append one object."""
@@ -145,13 +151,12 @@ class ItemFiles:
 
     def fingerprint(self) -> dict[str, Any]:
         """Return the lengths of both files and a digest of their contents."""
-        digest = hashlib.sha256()
-        lengths = {}
-        for name, path in self._paths().items():
-            lengths[name] = path.stat().st_size if path.exists() else 0
-            if lengths[name]:  # devices have no length, and some no end
-                digest.update(path.read_bytes())
-        return {**lengths, "sha256": digest.hexdigest()}
+        # Devices have no length, and some no end.
+        table, details = (
+            path.read_bytes() if path.is_file() else b"" for path in (self.table, self.details)
+        )
+        digest = hashlib.sha256(table + details).hexdigest()
+        return {"table": len(table), "details": len(details), "sha256": digest}
 
     def check(self, noted: Mapping[str, Any], advice: str) -> None:
         """Check that the files are as they were at an earlier :meth:`fingerprint`.
@@ -177,13 +182,10 @@ class ItemFiles:
         Raises:
             ValueError: If the files hold less than they did, or something else.
         """
-        for name, path in self._paths().items():
-            if path.exists() and path.stat().st_size > noted[name]:
-                os.truncate(path, noted[name])
+        for path, length in ((self.table, noted["table"]), (self.details, noted["details"])):
+            if path.exists() and path.stat().st_size > length:
+                os.truncate(path, length)
         self.check(noted, f"restore them, or {self.advice}")
-
-    def _paths(self) -> dict[str, Path]:
-        return {"table": self.table, "details": self.details}
 
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Declare the item complete and drop its checkpoints."""
@@ -243,20 +245,6 @@ class ItemFiles:
             )
         self.check(done, _ADVICE)
         return done
-
-
-def commits_of(done: Mapping[str, Any]) -> list[str | None]:
-    """Return the commits of all sessions; old results contain only that of the last."""
-    return done.get("commits", [done["machine"]["commit"]])
-
-
-def _format(value: float | None) -> str:
-    """Write five digits, more than a curve shows; whole numbers stay whole."""
-    if value is None:
-        return ""
-    if not math.isfinite(value):
-        raise ValueError(f"a measurement must be finite, got {value}")
-    return str(value) if isinstance(value, int) else f"{value:.5g}"
 
 
 def _whole_lines(path: Path) -> list[str]:

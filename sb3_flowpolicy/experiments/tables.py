@@ -1,12 +1,11 @@
-"""Results of an experiment as rows of text, for the page and for Markdown."""
+"""Results of an experiment as tables of text, for the page and for Markdown."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import pandas as pd
 
 from sb3_flowpolicy.common.statistics import Estimate, interquartile_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.store import commits_of
 from sb3_flowpolicy.experiments.work import FIRST_SEED
 
 WORDS = {
@@ -25,17 +24,10 @@ WORDS = {
 _DECIMALS = {"ent_coef": 4, "x_std": 3, "x_max": 3}
 
 
-@dataclass(frozen=True)
-class Table:
-    """Head and rows of text."""
-
-    head: list[str]
-    rows: list[list[str]]
-
-    def markdown(self) -> str:
-        """Return the table as Markdown."""
-        lines = [self.head, ["---"] * len(self.head), *self.rows]
-        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table of text as Markdown."""
+    lines = [table.columns, ["---"] * len(table.columns), *table.to_numpy()]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def in_digits(metric: str, estimate: Estimate) -> str:
@@ -43,74 +35,53 @@ def in_digits(metric: str, estimate: Estimate) -> str:
     return f"{estimate:.{_DECIMALS.get(metric, 2)}f}"
 
 
-_METRICS = ("train_return", "train_success", "test_return", "test_success", "entropy", "ent_coef")
-
-
-def results_table(evidence: Evidence) -> Table:
+def results_table(evidence: Evidence) -> pd.DataFrame:
     """Return final values of every agent on every setting, with counts of seeds that solved it."""
-    measured = evidence.measured
-    known = {name for s, a in measured for name in evidence.columns(s.name, a.name)}
-    metrics = [name for name in (*_METRICS, *sorted(known - set(_METRICS))) if name in known]
-    counted = "test_success" in known
-    head = ["setting", "agent", "seeds"]
-    head += ["solved at the end", "at its best", "steps until solved"] if counted else []
-    head += [WORDS.get(name, name) for name in metrics]
     rows = []
-    for setting, agent in measured:
-        columns = evidence.columns(setting.name, agent.name)
-        _, values = evidence.curves(setting.name, agent.name, columns[0])
-        row = [setting.name, agent.label, str(len(values))]
-        if counted:
-            row += _counts(evidence, setting.name, agent.name)
-        for name in metrics:
-            if name in columns:
-                final = interquartile_mean(evidence.final(setting.name, agent.name, name))
-                row.append(in_digits(name, final))
-            else:
-                row.append("-")
+    for setting, agent in evidence.measured:
+        pair, metrics = (setting.name, agent.name), evidence.columns(setting.name, agent.name)
+        finals = {name: evidence.final(*pair, name) for name in metrics}
+        row = {"setting": setting.name, "agent": agent.label, "seeds": ""}
+        if "test_success" in metrics:
+            solved, once = evidence.solved(*pair), evidence.solved_once(*pair)
+            steps = interquartile_mean(evidence.steps_until_solved(*pair))
+            row["solved at the end"] = f"{solved.sum()} of {len(solved)}"
+            row["at its best"] = f"{once.sum()} of {len(once)}"
+            row["steps until solved"] = f"{steps:,.0f}" if once.any() else "never"
+        for name, final in finals.items():
+            row["seeds"] = str(len(final))
+            row[WORDS.get(name, name)] = in_digits(name, interquartile_mean(final))
         rows.append(row)
-    return Table(head, rows)
-
-
-def _counts(evidence: Evidence, setting: str, agent: str) -> list[str]:
-    if "test_success" not in evidence.columns(setting, agent):
-        return ["-"] * 3
-    solved, once = evidence.solved(setting, agent), evidence.solved_once(setting, agent)
-    steps = interquartile_mean(evidence.steps_until_solved(setting, agent))
-    return [
-        f"{solved.sum()} of {len(solved)}",
-        f"{once.sum()} of {len(once)}",
-        f"{steps:,.0f}" if once.any() else "never",
-    ]
+    return pd.DataFrame(rows).fillna("-")
 
 
 def facts(evidence: Evidence) -> dict[str, str]:
     """Return the origin of the results: command, seeds, cost, commit, machine."""
-    done = [one for one in evidence.done.values() if one]
-    seeds, steps = evidence.seeds, evidence.settings.get("steps", evidence.experiment.steps)
-    command = f"python -m sb3_flowpolicy.experiments run {evidence.experiment.name}"
-    if steps != evidence.experiment.steps:
+    experiment, done = evidence.experiment, [one for one in evidence.done.values() if one]
+    seeds = evidence.settings.get("seeds", [])
+    steps = evidence.settings.get("steps", experiment.steps)
+    command = f"python -m sb3_flowpolicy.experiments run {experiment.name}"
+    if steps != experiment.steps:
         command += f" --steps {steps}"
-    if seeds and len(seeds) != evidence.experiment.seeds:
+    if seeds and len(seeds) != experiment.seeds:
         command += f" --seeds {len(seeds)}"
     if seeds and seeds[0] != FIRST_SEED:
         command += f" --first-seed {seeds[0]}"
     found = {"command": command}
-    if not evidence.items:
-        return found
-    found["seeds"] = f"{seeds[0]} to {seeds[-1]}, {steps:,} steps each"
-    found["items"] = f"{len(done)} of {len(evidence.items)} finished"
+    if evidence.items:
+        found["seeds"] = f"{seeds[0]} to {seeds[-1]}, {steps:,} steps each"
+        found["items"] = f"{len(done)} of {len(evidence.items)} finished"
     if done:
-        machine = done[-1]["machine"]
         hours = sum(one["cpu_seconds"] for one in done) / 3600
         speeds = [one["steps_per_second"] for one in done]
         found["cost"] = (
             f"{hours:.2f} core hours; {min(speeds):,.0f} to {max(speeds):,.0f} steps per second "
             "and process, seeds summed"
         )
-        found["commit"] = ", ".join(
-            sorted({str(commit) for one in done for commit in commits_of(one)})
-        )
+        # Old results contain only the commit of the last session.
+        commits = [one.get("commits", [one["machine"]["commit"]]) for one in done]
+        found["commit"] = ", ".join(sorted({str(commit) for each in commits for commit in each}))
+        machine = done[-1]["machine"]
         versions = machine["versions"]
         found["machine"] = (
             f"{machine['cpu_count']} cores {machine['processor']}, Python {machine['python']}, "

@@ -1,4 +1,4 @@
-"""Curves: on a common grid, smoothed, and the swings counted."""
+"""Curves: on a common grid, and their swings counted."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sb3_flowpolicy.experiments.curves import running_mean, swings
-from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.evidence import Evidence, swings
 from sb3_flowpolicy.experiments.manifest import find
 
 
@@ -21,13 +20,9 @@ def test_logs_of_unequal_length_meet_on_a_grid(tmp_path: Path) -> None:
         "entropy": [20, np.nan, 60, 80, 1, 3],
     }
     evidence._logs = {("narrow", "flow"): pd.DataFrame(log)}
-    steps, values = evidence.curves("narrow", "flow", "entropy")
-    assert steps.tolist() == [10, 15, 20, 25]
-    assert values.tolist() == [[20, 30, 40, 50], [1, 1, 2, 3]]
-
-
-def test_running_mean_is_shorter_at_the_start() -> None:
-    assert running_mean(np.arange(5.0), 3).tolist() == [0, 0.5, 1, 2, 3]
+    curves = evidence.curves("narrow", "flow", "entropy")
+    assert curves.index.tolist() == [10, 15, 20, 25]
+    assert curves.to_numpy().T.tolist() == [[20, 30, 40, 50], [1, 1, 2, 3]]
 
 
 @pytest.mark.parametrize(
