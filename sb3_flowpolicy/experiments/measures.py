@@ -6,7 +6,7 @@ gives the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -66,14 +66,8 @@ def _buffer_states(model: SACFlow, seed: int) -> th.Tensor:
     return th.as_tensor(buffer.observations[rows, 0])
 
 
-MEASURES: dict[str, Callable[[SACFlow, int], float]] = {
-    "same_axis_correlation": same_axis_correlation
-}
-"""Further columns of a table, chosen by an experiment."""
-
 TRAINING_INFOS = ("x_std", "x_max")
-"""Further columns: means over the training episodes since the last measurement, from their infos
-(thesis Fig. 3.18)."""
+"""Means over the training episodes since the last measurement (thesis Fig. 3.18)."""
 
 
 class DeterministicEpisodes:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Sequence
+from typing import Any
 
 from tqdm import tqdm
 
@@ -22,11 +24,10 @@ class Progress:
         self, items: Sequence[WorkItem], finished: Sequence[str] = (), shown: bool = True
     ) -> None:
         self.items = {item.key: item for item in items}
-        self.steps = {item.key: item.steps for item in items if item.key in finished}
-        amounts = {item.key: item.steps * len(item.seeds) for item in items}
+        self.steps = {key: self.items[key].steps for key in finished}
         self.bar = tqdm(
-            total=sum(amounts.values()),
-            initial=sum(amounts[key] for key in finished),
+            total=sum(item.steps * len(item.seeds) for item in items),
+            initial=sum(item.steps * len(item.seeds) for item in items if item.key in finished),
             desc="all",
             unit=" steps",
             unit_scale=True,
@@ -42,13 +43,18 @@ class Progress:
         self.steps[key] = steps
         if not known and not self.bar.disable:
             self.bar.initial += gained  # an earlier session's steps are no measure of this speed
-        shares = {
-            key: steps / self.items[key].steps
-            for key, steps in self.steps.items()
-            if steps < self.items[key].steps
-        }
-        self.bar.set_postfix_str(", ".join(f"{k} {v:.0%}" for k, v in shares.items()), False)
+        shares = {name: done / self.items[name].steps for name, done in self.steps.items()}
+        at_work = (f"{name} {share:.0%}" for name, share in shares.items() if share < 1)
+        self.bar.set_postfix_str(", ".join(at_work), False)
         self.bar.update(gained)
+
+    def take(self, reports: Any) -> None:
+        """Note all reports of a queue: pairs of an item's key and its steps."""
+        while True:
+            try:
+                self.update(*reports.get_nowait())
+            except queue.Empty:
+                return
 
     def close(self) -> None:
         """Close the bar."""

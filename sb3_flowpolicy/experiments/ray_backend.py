@@ -7,10 +7,10 @@ lost starts again on another one.
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.experiments.progress import Progress
@@ -44,6 +44,7 @@ def run_on_ray(
     try:
         import ray
         from ray.exceptions import RayError, RayTaskError
+        from ray.util.queue import Queue
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
@@ -55,16 +56,15 @@ def run_on_ray(
     environment = {"env_vars": dict.fromkeys(ONE_THREAD, "1")}
     # On the runner's machine, which is the only one that must not be lost.
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-    board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
+    reports = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
     task = ray.remote(_run_away).options(
         num_cpus=1, max_retries=MOST_RETRIES, runtime_env=environment
     )
-    waiting = {task.remote(item, board): item for item in items}
+    waiting = {task.remote(item, reports): item for item in items}
     try:
         while waiting:
             done, _ = ray.wait(list(waiting), timeout=_POLL_SECONDS)
-            for key, steps in ray.get(board.take.remote()).items():
-                progress.update(key, steps)
+            progress.take(reports)
             for reference in done:
                 item = waiting.pop(reference)
                 for name, data in ray.get(reference).items():
@@ -84,33 +84,16 @@ def run_on_ray(
     finally:
         for reference in waiting:
             ray.cancel(reference, force=True)
-        ray.kill(board)
+        reports.shutdown(force=True)
 
 
-class _Board:
-    """Collects the progress of all tasks on the runner's machine."""
-
-    def __init__(self) -> None:
-        self.steps: dict[str, int] = {}
-
-    def post(self, key: str, steps: int) -> None:
-        self.steps[key] = steps
-
-    def take(self) -> dict[str, int]:
-        steps, self.steps = self.steps, {}
-        return steps
-
-
-def _run_away(item: WorkItem, board: object) -> dict[str, bytes]:
+def _run_away(item: WorkItem, reports: Any) -> dict[str, bytes]:
     """Do an item on another machine, and return its files."""
     from sb3_flowpolicy.experiments.training import run_item
 
-    folder = Path(tempfile.mkdtemp(prefix="sb3_flowpolicy_"))
-    try:
-        run_item(item, folder, lambda key, steps: board.post.remote(key, steps))  # type: ignore[attr-defined]
-        files = ItemFiles(folder, item.key)
+    with tempfile.TemporaryDirectory(prefix="sb3_flowpolicy_", ignore_cleanup_errors=True) as name:
+        files = ItemFiles(Path(name), item.key)
+        run_item(item, files.folder, lambda key, steps: reports.put((key, steps)))
         # The file that declares the item finished comes last.
         paths = (files.table, files.details, files.done)
         return {path.name: path.read_bytes() for path in paths if path.exists()}
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

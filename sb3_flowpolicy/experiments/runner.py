@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import queue
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -85,11 +84,11 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
         running: set[Future] = {pool.submit(_work, item, folder) for item in longest_first}
         try:
             while running:
-                _pass_on(reports, progress)
+                progress.take(reports)
                 done, running = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in done:
                     future.result()
-            _pass_on(reports, progress)
+            progress.take(reports)
         except BrokenProcessPool as error:
             raise RuntimeError(
                 "a process was killed, perhaps because memory ran out; the same command goes on "
@@ -101,14 +100,6 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
             for process in multiprocessing.active_children():
                 process.terminate()
             raise
-
-
-def _pass_on(reports: Any, progress: Progress) -> None:
-    while True:
-        try:
-            progress.update(*reports.get_nowait())
-        except queue.Empty:
-            return
 
 
 def _start_worker(reports: Any) -> None:

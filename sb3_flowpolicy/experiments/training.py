@@ -17,14 +17,14 @@ from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.common.machine import machine
 from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
 from sb3_flowpolicy.experiments.measures import (
-    MEASURES,
     TRAINING_INFOS,
     DeterministicEpisodes,
     entropy_profile,
     policy_entropy,
     policy_picture,
+    same_axis_correlation,
 )
-from sb3_flowpolicy.experiments.store import ItemFiles, Row
+from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import WorkItem, environment
 from sb3_flowpolicy.seeds.batch import SeedBatch
 from sb3_flowpolicy.seeds.setup import make_env
@@ -85,26 +85,36 @@ class _Training:
         self.stacked = not item.hyperparameters.get("use_sde")
         self.groups = [item.seeds] if self.stacked else [(seed,) for seed in item.seeds]
         self.infos = [name for name in TRAINING_INFOS if name in item.measures]
-        self.steps = 0
         self.started, self.cpu_started = time.perf_counter(), time.process_time()
-        self.seconds_before, self.cpu_before, self.sessions = 0.0, 0.0, 1
+        # Of earlier sessions.
+        self.before: dict[str, Any] = {"seconds": 0, "cpu_seconds": 0, "sessions": 0, "commits": []}
         # At the start: later the files on disk may be of another commit.
         self.machine = machine()
-        self.commits = [self.machine["commit"]]
 
     def run(self) -> None:
         begun = [k for k in range(len(self.groups)) if any(self._folder(k).glob("*-step-*"))]
         if not begun:
             self.files.cut_to({"table": 0, "details": 0})
+        steps = 0
         for k in range(begun[-1] if begun else 0, len(self.groups)):
-            self._train(k, resumed=k in begun)
-        self.files.finish(self._facts())
+            steps = self._train(k, resumed=k in begun)
+        totals, seeds = self._totals(), self.item.seeds
+        facts = {
+            "steps": steps,
+            "seeds": list(seeds),
+            "seconds": round(totals["seconds"], 1),
+            "cpu_seconds": round(totals["cpu_seconds"], 1),
+            "steps_per_second": round(self.item.steps * len(seeds) / totals["seconds"], 1),
+            "sessions": totals["sessions"],
+            "commits": list(dict.fromkeys(totals["commits"])),
+        }
+        self.files.finish({**facts, **self.files.fingerprint(), "machine": self.machine})
 
     def _folder(self, group: int) -> Path:
         return self.files.checkpoints / f"group-{group}"
 
-    def _train(self, group: int, resumed: bool) -> None:
-        """Train a group of seeds to its end."""
+    def _train(self, group: int, resumed: bool) -> int:
+        """Train a group of seeds to its end, and return the steps that it has done."""
         item = self.item
         learner = self._resume(group) if resumed else self._begin(group)
         models = learner.models if isinstance(learner, SeedBatch) else [learner]
@@ -118,7 +128,8 @@ class _Training:
             # The first call of a resumed run has to take over its folder of checkpoints.
             due = end < item.steps and (crossed or first)
             if models[0].num_timesteps < end:
-                vars(models[0])[_PROGRESS] = self._progress(stage)
+                progress = {"start": stage, "files": self.files.fingerprint(), **self._totals()}
+                vars(models[0])[_PROGRESS] = progress
                 # More steps than there are: the only checkpoint is that at the end of the call.
                 every = 2 * item.steps if due else None
                 learner.learn(
@@ -144,7 +155,7 @@ class _Training:
             # To draw pictures of; before the item is declared complete.
             self.files.agent.parent.mkdir(exist_ok=True)
             models[0].save(self.files.agent)
-        self.steps = stage
+        return stage
 
     def _begin(self, group: int) -> SeedBatch | SACFlow:
         settings = {"device": "cpu", **self.item.hyperparameters}
@@ -169,33 +180,30 @@ class _Training:
         except ValueError as error:
             raise ValueError(f"{error}: {self.files.advice}") from error
         first = learner.models[0] if isinstance(learner, SeedBatch) else learner
-        noted = vars(first)[_PROGRESS]
-        self.files.cut_to(noted["files"])
-        self.seconds_before, self.cpu_before = noted["seconds"], noted["cpu_seconds"]
-        self.sessions = noted["sessions"] + 1
-        self.commits = [*noted["commits"], *self.commits]
+        self.before = vars(first)[_PROGRESS]
+        self.files.cut_to(self.before["files"])
         return learner
 
     def _monitored(self) -> Monitor:
         return Monitor(make_env(self.env), info_keywords=tuple(self.infos))
 
-    def _progress(self, start: int) -> dict[str, Any]:
+    def _totals(self) -> dict[str, Any]:
+        """Return time, number and commits of all sessions so far."""
         return {
-            "start": start,
-            "files": self.files.fingerprint(),
-            "seconds": self._seconds(),
-            "cpu_seconds": self._cpu_seconds(),
-            "sessions": self.sessions,
-            "commits": self.commits,
+            "seconds": self.before["seconds"] + time.perf_counter() - self.started,
+            # On a core of its own; other processes may share this one.
+            "cpu_seconds": self.before["cpu_seconds"] + time.process_time() - self.cpu_started,
+            "sessions": self.before["sessions"] + 1,
+            "commits": [*self.before["commits"], self.machine["commit"]],
         }
 
     def _tell(self, group: int, steps: int) -> None:
         self.report(self.item.key, (group * self.item.steps + steps) // len(self.groups))
 
-    def _row(self, model: Any, tested: tuple[float, float | None]) -> Row:
+    def _row(self, model: Any, tested: tuple[float, float | None]) -> dict[str, float | None]:
         """Measure one agent, and forget the episodes that the row accounts for."""
         episodes, success, seed = model.ep_info_buffer, model.ep_success_buffer, model.seed
-        row: Row = {
+        row = {
             "seed": seed,
             "step": model.num_timesteps,
             "episodes": len(episodes),
@@ -206,11 +214,9 @@ class _Training:
             "entropy": policy_entropy(model, seed),
             "ent_coef": _ent_coef(model),
         }
-        for name in self.infos:
-            row[name] = _mean([episode[name] for episode in episodes])
-        for name, measure in MEASURES.items():
-            if name in self.item.measures:
-                row[name] = measure(model, seed)
+        row |= {name: _mean([episode[name] for episode in episodes]) for name in self.infos}
+        if "same_axis_correlation" in self.item.measures:
+            row["same_axis_correlation"] = same_axis_correlation(model, seed)
         episodes.clear()
         success.clear()
         return row
@@ -221,27 +227,6 @@ class _Training:
             if content is not None:
                 head = {"kind": kind, "seed": model.seed, "step": model.num_timesteps}
                 self.files.append_detail({**head, **content})
-
-    def _seconds(self) -> float:
-        return self.seconds_before + time.perf_counter() - self.started
-
-    def _cpu_seconds(self) -> float:
-        """Time on a core of its own; other processes may share this one."""
-        return self.cpu_before + time.process_time() - self.cpu_started
-
-    def _facts(self) -> dict[str, Any]:
-        seconds, item = self._seconds(), self.item
-        return {
-            "steps": self.steps,
-            "seeds": list(item.seeds),
-            "seconds": round(seconds, 1),
-            "cpu_seconds": round(self._cpu_seconds(), 1),
-            "steps_per_second": round(item.steps * len(item.seeds) / seconds, 1),
-            "sessions": self.sessions,
-            "commits": list(dict.fromkeys(self.commits)),
-            **self.files.fingerprint(),
-            "machine": self.machine,
-        }
 
 
 def _mean(values: list[float]) -> float | None:

@@ -20,19 +20,10 @@ QUICK_STEPS, QUICK_SEEDS = 3000, 2
 # Short runs write this many checkpoints, long ones one per so many steps.
 CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS = 6, 50_000
 
-STEPS_PER_SECOND = {
-    16: {"sac_gauss": 3300.0, "sac_lowrank": 2450.0, "sac_flow": 2400.0},
-    128: {"sac_gauss": 390.0, "sac_lowrank": 370.0, "sac_flow": 340.0},
-    256: {"sac_gauss": 105.0, "sac_lowrank": 103.0, "sac_flow": 99.0},
-}
-"""Units of the critics' layers -> agent -> steps per second, summed over ten seeds of one process
-with one thread, on one of two idle cores of an AMD EPYC (docs/benchmarks.md).
-
-16: ``learn()`` of ten seeds; for sac_lowrank, sac_gauss's rate times their ratio as single agents.
-128 and 256: updates of single agents, as stacking does not speed up large matrix products. All
-blocks do one update per step, which dominates the time. The real times of a run are in its
-``.done.json`` files.
-"""
+STEPS_PER_SECOND = {16: 2400.0, 128: 340.0, 256: 99.0}
+"""Units of the critics' layers -> steps per second of NF, summed over ten seeds of one process with
+one thread, on one of two idle cores of an AMD EPYC (docs/benchmarks.md); Gauss is up to a third
+faster. All blocks do one update per step, which dominates the time."""
 
 GSDE_STEPS_PER_SECOND = 250.0
 """gSDE runs in SB3's own loop, one seed after the other, at this speed for all small networks."""
@@ -265,11 +256,7 @@ def item_seconds(item: WorkItem) -> float:
     settings = item.hyperparameters
     net_arch = settings.get("policy_kwargs", {}).get("net_arch", [256, 256])
     critic = net_arch["qf"] if isinstance(net_arch, dict) else net_arch
-    width = min(STEPS_PER_SECOND, key=lambda known: abs(known - max(critic)))
-    algo = {"GaussPolicy": "sac_gauss", "LowRankPolicy": "sac_lowrank"}.get(
-        settings["policy"], "sac_flow"
-    )
-    speed = STEPS_PER_SECOND[width][algo]
+    speed = STEPS_PER_SECOND[min(STEPS_PER_SECOND, key=lambda known: abs(known - max(critic)))]
     if settings.get("use_sde"):
         speed = min(speed, GSDE_STEPS_PER_SECOND)
     return _START_SECONDS + item.steps * len(item.seeds) / speed
