@@ -8,13 +8,18 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+import pandas as pd
+
 from sb3_flowpolicy.common.command_line import HelpFormatter, check_folder_of
+from sb3_flowpolicy.common.files import write_json
 from sb3_flowpolicy.experiments.dimensions.prediction import (
     WIDTHS,
     bound,
     correlated,
     independent,
 )
+
+_FAMILIES = {"independent": independent, "correlated": correlated}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -34,38 +39,54 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--survival must be in (0, 1), got {args.survival}")
     for name in ("json", "figure"):
         check_folder_of(parser, f"--{name}", getattr(args, name))
-    print(
-        f"{'D':>3}{'width':>9}{'uniform':>9}{'any density':>13}{'correlated':>12}"
-        f"{'independent':>13}{'gap':>7}{'progress: correlated':>22}{'independent':>13}"
-    )
-    rows = []
-    for dims, width in WIDTHS.items():
-        alone = independent(dims, width, args.survival)
-        joint = correlated(dims, width, args.survival)
-        best, uniform = bound(dims, args.survival), dims * math.log(2.0)
-        print(
-            f"{dims:3d}{width:9.4f}{uniform:9.2f}{best:13.2f}{joint.entropy:12.2f}"
-            f"{alone.entropy:13.2f}{joint.entropy - alone.entropy:7.2f}{joint.progress:22.3f}"
-            f"{alone.progress:13.3f}"
-        )
-        rows.append(
-            {
-                "dims": dims,
-                "width": width,
-                "uniform": uniform,
-                "bound": best,
-                "correlated": asdict(joint),
-                "independent": asdict(alone),
-            }
-        )
+    rows = [
+        {
+            "dims": dims,
+            "width": width,
+            "uniform": dims * math.log(2.0),
+            "bound": bound(dims, args.survival),
+            **{k: asdict(best(dims, width, args.survival)) for k, best in _FAMILIES.items()},
+        }
+        for dims, width in WIDTHS.items()
+    ]
+    table = pd.json_normalize(rows).set_index("dims")
+    told = ["width", "uniform", "bound"]
+    told += [f"{family}.{what}" for what in ("entropy", "progress") for family in _FAMILIES]
+    print(table[told].to_string(float_format="{:.4f}".format))
     if args.json is not None:
-        from sb3_flowpolicy.common.files import write_json
-
         write_json(args.json, {"survival": args.survival, "rows": rows})
     if args.figure is not None:
-        from sb3_flowpolicy.experiments.dimensions.figure import draw
+        _draw(table, args.figure, args.survival)
 
-        args.figure.write_bytes(draw(rows, args.survival))
+
+def _draw(table: pd.DataFrame, path: Path, survival: float) -> None:
+    """Draw entropy and progress by number of dimensions."""
+    # Slow imports that the table does not need.
+    from sb3_flowpolicy.diagnostics.figures import new_figure
+    from sb3_flowpolicy.experiments.figures import COLORS
+
+    figure = new_figure(9.0, 3.4)
+    left, right = figure.subplots(1, 2)
+    for label, name, shade in (
+        ("any density", "bound", "#555555"),
+        ("LR (any rank), full covariance", "correlated", COLORS["lowrank"]),
+        ("Gauss", "independent", COLORS["gauss"]),
+    ):
+        entropy = table.get(f"{name}.entropy", table["bound"])
+        left.plot(entropy - table["uniform"], "o-", color=shade, label=label, markersize=4)
+        if name != "bound":
+            right.plot(table[f"{name}.progress"], "o-", color=shade, markersize=4)
+    left.set(title="highest entropy, less that of the uniform density", ylabel="nats")
+    right.set(title="standard deviation of the progress of a step", ylabel="share of the reach")
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(table.index, table.index.astype(str))
+        axes.minorticks_off()
+        axes.set_xlabel(f"coupled dimensions; {survival:.0%} of the steps survive")
+        axes.grid(color="#eeeeee")
+    right.set_ylim(bottom=0.0)
+    left.legend(frameon=False)
+    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -64,40 +64,10 @@ class Prediction:
     common: float
 
 
-def random_survival(dims: int, width: float, samples: int = 10**6, seed: int = 0) -> float:
-    """Estimate the probability that a uniformly random first step stays in the tunnel.
-
-    Args:
-        dims: Number of coupled dimensions D, at least 2.
-        width: Width of the tunnel, world units.
-        samples: Number of random steps.
-        seed: Seed of these.
-
-    Example:
-        >>> round(random_survival(2, WIDTHS[2]), 2)
-        0.09
-    """
-    rng, inside = np.random.default_rng(seed), 0
-    for count in _portions(samples, dims):
-        inside += int((_offset(rng.uniform(-1.0, 1.0, (count, dims))) <= _radius(width)).sum())
-    return inside / samples
-
-
-def width_for(dims: int, samples: int = 10**6, seed: int = 0) -> float:
-    """Estimate the width at which as many random first steps survive as with two dimensions.
-
-    Args:
-        dims: Number of coupled dimensions D, at least 2.
-        samples: Number of random steps.
-        seed: Seed of these.
-
-    Example:
-        >>> round(width_for(2), 3)
-        0.017
-    """
-    rng = np.random.default_rng(seed)
-    parts = [_offset(rng.uniform(-1.0, 1.0, (n, dims))) for n in _portions(samples, dims)]
-    return 2.0 * REACH * float(np.quantile(np.concatenate(parts), SURVIVAL_OF_RANDOM_STEPS))
+def survival_of(actions: NDArray[np.float64], width: float) -> float:
+    """Return the share of actions (N, D) at the center line that stay in the tunnel."""
+    offsets = np.linalg.norm(actions - actions.mean(axis=1, keepdims=True), axis=1)
+    return float((offsets <= width / (2.0 * REACH)).mean())
 
 
 def bound(dims: int, survival: float) -> float:
@@ -137,13 +107,7 @@ def correlated(dims: int, width: float, survival: float, seed: int = 0) -> Predi
 
     The coordinates can be exchanged, so the best covariance that treats them alike is a multiple of
     the identity plus common noise. A low-rank policy of any rank contains it, and so does one with
-    a full covariance: their predictions coincide.
-
-    Args:
-        dims: Number of coupled dimensions D, at least 2.
-        width: Width of the tunnel, world units.
-        survival: Probability with which a step survives, in (0, 1).
-        seed: Seed of the estimate.
+    a full covariance: their predictions coincide. Arguments as in :func:`independent`.
     """
     return _best(dims, width, survival, (0.0, *_COMMON_SCALES), seed)
 
@@ -156,10 +120,8 @@ def _best(
     candidates = []
     for common in commons:
         scale = _widest(common * shared, own, width, survival)
-        actions = np.tanh(common * shared + scale * own)
-        progress = float(actions.mean(axis=1).std())
-        entropy = _entropy(dims, scale, common)
-        candidates.append(Prediction(entropy, progress, scale, float(common)))
+        progress = float(np.tanh(common * shared + scale * own).mean(axis=1).std())
+        candidates.append(Prediction(_entropy(dims, scale, common), progress, scale, float(common)))
     return max(candidates, key=lambda one: one.entropy)
 
 
@@ -173,8 +135,7 @@ def _widest(
     low, high = math.log(1e-4), math.log(0.88)
     for _ in range(18):
         middle = (low + high) / 2.0
-        offsets = _offset(np.tanh(shared + math.exp(middle) * own))
-        survives = (offsets <= _radius(width)).mean() >= survival
+        survives = survival_of(np.tanh(shared + math.exp(middle) * own), width) >= survival
         low, high = (middle, high) if survives else (low, middle)
     return math.exp(low)
 
@@ -186,18 +147,3 @@ def _entropy(dims: int, scale: float, common: float) -> float:
     size = np.abs(math.hypot(scale, common) * _NODES)
     log_slope = 2.0 * (math.log(2.0) - size - np.log1p(np.exp(-2.0 * size)))
     return normal + dims * float(_WEIGHTS @ log_slope / _WEIGHTS.sum())
-
-
-def _offset(actions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances (N,) of actions (N, D) from the diagonal."""
-    return np.asarray(np.linalg.norm(actions - actions.mean(axis=1, keepdims=True), axis=1))
-
-
-def _radius(width: float) -> float:
-    return width / (2.0 * REACH)
-
-
-def _portions(samples: int, dims: int) -> list[int]:
-    """Split a number of samples so that one portion needs little memory."""
-    most = max(1, 4 * 10**6 // dims)
-    return [most] * (samples // most) + ([samples % most] if samples % most else [])
