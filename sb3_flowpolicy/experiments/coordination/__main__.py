@@ -32,21 +32,21 @@ expect trained policies to differ.
 Columns: median actions that press along x and y, V, entropy of the squashed actions (nats), hazard
 per step, share of it in which a finger breaks, reward per step and its share of the reward for
 holding, and, averaged over episodes after the warm-up, standard deviation of x, maximum of |x|,
-maximum distance from the middle, and the share of episodes in which the goal was found."""
+maximum distance from the middle, and the share of episodes in which the goal was found. The second
+table compares with independent noise: differences of V and entropy, ratios of the others."""
 _EPILOG = """\
 examples:
   coordination SquareMoveX-v1
   coordination SquareMoveX-v1 --set max_force=2.4 --task effort=0.1 angle=1
-  coordination SquareHold-v1 --ent-coef 0.15 --modes
+  coordination SquareHold-v1 --ent-coef 0.15
   coordination SquareFindGoal-v1 --budget 1000 --json prediction.json
 each after `python -m sb3_flowpolicy.experiments.`
 
 With the default budget, a family takes about half a minute on one core. The objective is noisy:
 compare searches with other --seed values before you rely on a small difference."""
 
-_HEAD = (
-    "family       press x, y     V  entropy  hazard broken reward kept  x std  x max distance goals"
-)
+
+_OPTIONS = ("ent_coef", "gamma", "episodes", "budget", "seed")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -65,17 +65,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--ent-coef", type=float, default=0.05, help="entropy coefficient (default: 0.05)")
     add("--gamma", type=float, default=0.9, help="discount factor (default: 0.9)")
     names = ("independent", "pink", "rank 2", "full")
-    families = f"some of {', '.join(map(repr, names))} (default: all)"
-    add("--families", nargs="+", choices=names, default=names, metavar="NAME", help=families)
+    some = f"some of {', '.join(map(repr, names))} (default: all)"
+    add("--families", nargs="+", choices=names, default=names, metavar="NAME", help=some)
     add("--budget", type=int, default=800, help="candidates per family (default: 800)")
     add("--episodes", type=int, default=48, help="episodes per candidate (default: 48)")
     add("--seed", type=int, default=0, help="seed of the search (default: 0)")
-    add("--modes", action="store_true", help="also print the noise of each joint motion")
     add("--json", type=Path, metavar="FILE", help="also write the results to this file")
     args = parser.parse_args(arguments)
     check_folder_of(parser, "--json", args.json)
     # Slow imports that --help does not need.
     try:
+        import pandas as pd
         from tqdm import tqdm
 
         from sb3_flowpolicy.common.files import write_json
@@ -83,49 +83,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
 
+    options = {name: getattr(args, name) for name in _OPTIONS}
     try:
-        setting = setting_of(
-            args.env,
-            dict(args.task),
-            dict(args.set),
-            ent_coef=args.ent_coef,
-            gamma=args.gamma,
-            episodes=args.episodes,
-            budget=args.budget,
-            seed=args.seed,
-        )
+        setting = setting_of(args.env, dict(args.task), dict(args.set), **options)
     except (ValueError, TypeError) as error:
         parser.error(str(error))
     with tqdm(total=args.budget * len({"independent", *args.families}), unit=" policies") as bar:
         found = predict(setting, args.families, bar.update)
-    print(_HEAD)
-    for name, row in found.items():
-        print(
-            f"{name:12s} {row.press_x:6.2f} {row.press_y:6.2f} {row.value:6.2f} {row.entropy:7.2f} "
-            f"{row.hazard:8.4f} {row.broken:6.2f} {row.reward:6.2f} {row.kept:4.2f} "
-            f"{row.x_std:6.3f} {row.x_max:6.3f} {row.distance_max:8.3f} {row.found:5.2f}"
-        )
-        if args.modes:
-            for mode, (first, second) in row.modes.items():
-                print(f"  {mode}: {first:.2f} and {second:.2f}")
-    base = found["independent"]
-    for name, row in found.items():
-        if name != "independent":
-            goals = f", goals x {row.found / base.found:.2f}" if base.found else ""
-            print(
-                f"{name} against independent: V {row.value - base.value:+.2f}, entropy "
-                f"{row.entropy - base.entropy:+.2f} nats, x std x {row.x_std / base.x_std:.2f}, "
-                f"x max x {row.x_max / base.x_max:.2f}{goals}"
-            )
+    families = {name: vars(prediction) for name, prediction in found.items()}
+    table = pd.DataFrame.from_dict(families, orient="index")
+    others, base = table.drop("independent"), table.loc["independent"]
+    differences = others[["value", "entropy"]] - base[["value", "entropy"]]
+    ratios = others[["x_std", "x_max", "found"]] / base[["x_std", "x_max", "found"]]
+    print(table.to_string(float_format="{:.3f}".format))
+    print("\nagainst independent noise:")
+    print(differences.join(ratios).to_string(float_format="{:.2f}".format))
     if args.json is not None:
-        told = {name: vars(row) for name, row in found.items()}
-        write_json(args.json, {"settings": _told(args), "families": told})
-
-
-def _told(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments as they were given."""
-    kept = {name: value for name, value in vars(args).items() if name not in ("json", "modes")}
-    return {**kept, "set": dict(args.set), "task": dict(args.task)}
+        given = {"env": args.env, "set": dict(args.set), "task": dict(args.task), **options}
+        write_json(args.json, {"settings": given, "families": families})
 
 
 if __name__ == "__main__":

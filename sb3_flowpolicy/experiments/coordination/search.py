@@ -22,7 +22,6 @@ from sb3_flowpolicy.experiments.coordination.families import (
     FAMILIES,
     INDEPENDENT_START,
     INWARDS,
-    MODES,
     Array,
 )
 
@@ -70,10 +69,9 @@ class Prediction:
         broken: Share of the failures in which a finger broke.
         reward: Mean reward without the penalty of a failure.
         kept: Reward as a share of the reward for holding.
-        x_std, x_max, distance_std, distance_max: The environment's metrics, averaged over episodes
-            in proportion to their steps after the warm-up.
+        x_std, x_max, distance_max: The environment's metrics, averaged over episodes in proportion
+            to their steps after the warm-up.
         found: Share of the episodes in which the goal was found.
-        modes: Standard deviation before squashing of each mode, in the order of `MODES`.
     """
 
     press_x: float
@@ -86,10 +84,8 @@ class Prediction:
     kept: float
     x_std: float
     x_max: float
-    distance_std: float
     distance_max: float
     found: float
-    modes: dict[str, tuple[float, ...]]
 
 
 def setting_of(
@@ -197,8 +193,8 @@ def measure(
     penalties = task.failure * out.failed[after].sum()
     reward = (out.rewards[after].sum() + penalties) / steps
     squashing = float((out.log_slopes[after] * out.taken[after]).sum()) / steps
-    covariance = root @ root.T
-    entropy = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * np.e * covariance)[1]) + squashing
+    normal = 0.5 * float(np.linalg.slogdet(2.0 * np.pi * np.e * root @ root.T)[1])
+    entropy = normal + squashing
     gain = reward + setting.ent_coef * entropy - task.failure * hazard
     metrics = dict(zip(METRICS, (lengths @ batch.metrics / steps).tolist(), strict=True))
     presses = np.tanh(INWARDS @ means / 2.0)
@@ -211,15 +207,8 @@ def measure(
         broken=int((batch.ends == kernels.BROKEN).sum()) / max(failures, 1),
         reward=float(reward),
         kept=float(reward / task.held) if task.held else 0.0,
-        x_std=metrics["x_std"],
-        x_max=metrics["x_max"],
-        distance_std=metrics["distance_std"],
-        distance_max=metrics["distance_max"],
+        **{name: metrics[name] for name in ("x_std", "x_max", "distance_max")},
         found=float(batch.found.mean()),
-        modes={
-            name: tuple(float(np.sqrt(mode @ covariance @ mode)) for mode in pair)
-            for name, pair in MODES.items()
-        },
     )
 
 

@@ -67,7 +67,7 @@ def test_command_writes_what_it_prints(tmp_path, capsys):
     told = json.loads(file.read_text())
     assert list(told["families"]) == ["independent", "pink"]
     assert told["settings"]["set"] == {"max_force": 2.4}
-    assert "pink against independent" in capsys.readouterr().out
+    assert "against independent noise" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
