@@ -15,13 +15,11 @@ Draw how trained agents explore a task of the Square, side by side, a column per
                    in the same sample, and paths of the square: do the fingers move together?
   correlation.png  absolute correlation of the eight actions (thesis Fig. 3.17); a chessboard means
                    that all x move together, and all y
-  sequence.png     the first seven steps after the warm-up, with an arrow from the mean to each
-                   target that was taken (thesis Fig. 3.19)
   film.webp        one episode of each agent from a second before the end of the warm-up
 
-Titles tell each model's seed and steps of training. Film, sequence, and
-targets show the first of ten episodes in which the agent does not lose the square (if it loses all,
-the first); its warm-up is deterministic, so that the agents start to explore from similar states.
+Titles tell each model's seed and steps of training. Film and targets show the first of ten episodes
+in which the agent does not lose the square (if it loses all, the first); its warm-up is
+deterministic, so that the agents start to explore from similar states.
 Paths, correlations, and the numbers printed are those of further episodes, sampled from the start
 and kept whatever their end. The same model, --seed, and --episodes give the same column, whatever
 the other models are."""
@@ -56,7 +54,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
 
     from sb3_flowpolicy.experiments.square_pictures import figures
-    from sb3_flowpolicy.experiments.square_pictures.film import write_film
     from sb3_flowpolicy.experiments.square_pictures.record import load_agent, record
 
     # All models are checked before the first is played.
@@ -65,13 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         record(label, model, args.env, args.seed, args.episodes) for label, model in agents
     ]
     args.output.mkdir(parents=True, exist_ok=True)
-    for name, draw in (
-        ("together", figures.together_figure),
-        ("correlation", figures.correlation_figure),
-        ("sequence", figures.sequence_figure),
-    ):
-        figures.save(draw(recordings), args.output / f"{name}.png")
-    write_film(recordings, args.output / "film.webp")
+    figures.together_figure(recordings).savefig(args.output / "together.png", dpi=110)
+    figures.correlation_figure(recordings).savefig(args.output / "correlation.png", dpi=110)
+    figures.write_film(recordings, args.output / "film.webp")
     for recording in recordings:
         print(
             f"{recording.label} ({recording.origin}): entropy {recording.entropy:.1f} nats, x std "

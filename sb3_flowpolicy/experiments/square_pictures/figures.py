@@ -1,14 +1,14 @@
-"""Drawings of recordings: a column per agent."""
+"""Drawings and film of recordings: a column per agent."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from flowpolicy_envs.square.rendering import RENDER_FPS
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.diagnostics.figures import new_figure
 from sb3_flowpolicy.experiments.square_pictures.record import N_SHOWN, Moment, Recording
@@ -21,14 +21,15 @@ FINGERS = ("right", "top", "left", "bottom")
 ACTIONS = tuple(f"{finger} {axis}" for finger in FINGERS for axis in "xy")
 SIDES = "coolwarm"
 """Colormap from blue, one end of the joint movement, to red, the other."""
-_LEFT, _RIGHT = "#2b4cc0", "#b40426"
+_LOST = "#b40426"
 _VIEW = 0.66
 """Half the edge of a view of the Square in world units."""
 _NUMBERS = 0.58
 """Distance of a finger's number from the middle."""
 _ARROW = {"arrowstyle": "-|>", "linewidth": 2, "color": "black", "shrinkA": 0, "shrinkB": 0}
 _SECONDS = 0.25
-SEQUENCE_STEPS = 7
+_HEAD = 20
+"""Height of the labels of a film in pixels."""
 
 
 def correlation_figure(recordings: Sequence[Recording]) -> Figure:
@@ -61,7 +62,7 @@ def together_figure(recordings: Sequence[Recording]) -> Figure:
     widest = max(np.nanmax(np.abs(recording.paths)) for recording in recordings) * 1.1
     for (above, below), recording in zip(grid.T, recordings, strict=True):
         above.set_title(_title(recording), fontsize=10)
-        _draw_samples(above, recording.moments[0])
+        _draw_samples(above, recording.moment)
         _draw_paths(below, recording)
         below.set(xlim=(0, _SECONDS * longest), ylim=(-widest, widest))
     grid[1, 0].set_ylabel("x of the square", fontsize=8)
@@ -76,39 +77,32 @@ def together_figure(recordings: Sequence[Recording]) -> Figure:
     return figure
 
 
-def sequence_figure(recordings: Sequence[Recording]) -> Figure:
-    """Draw the first steps after the warm-up, a row per step (thesis Fig. 3.19)."""
-    steps = min(SEQUENCE_STEPS, max(len(recording.moments) for recording in recordings))
-    figure = new_figure(1.7 * len(recordings) + 0.3, 1.7 * steps + 0.9)
-    grid = figure.subplots(steps, len(recordings), squeeze=False)
-    for column, recording in zip(grid.T, recordings, strict=True):
-        column[0].set_title(_title(recording), fontsize=7)
-        for k, axes in enumerate(column):
-            if k < len(recording.moments):
-                _draw_step(axes, recording.moments[k])
-            else:
-                axes.set(xticks=[], yticks=[])
-                axes.spines[:].set_color("#dddddd")
-                axes.text(0.5, 0.5, "lost", ha="center", transform=axes.transAxes, fontsize=8)
-    for k, axes in enumerate(grid[:, 0]):
-        axes.set_ylabel(f"step {k + 1}", fontsize=8)
-    figure.supxlabel(
-        "Dots: sampled targets, relative to their mean, at each finger.\n"
-        "Arrows: the target taken, twice as long. Red: to the right, blue: to the left.",
-        fontsize=8,
-    )
-    return figure
+def write_film(recordings: Sequence[Recording], path: Path) -> None:
+    """Write the agents' episodes as an animated WebP in real time, an image for browsers.
 
+    An episode that ends early rests on its last frame.
+    """
+    from PIL import Image, ImageDraw
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG of 256 colors, a third as large as one of all colors."""
-    from PIL import Image
-
-    full = BytesIO()
-    figure.savefig(full, dpi=110)
+    size = recordings[0].frames[0].shape[1]
+    pictures = []
+    for k in range(max(len(recording.frames) for recording in recordings)):
+        row = [recording.frames[min(k, len(recording.frames) - 1)] for recording in recordings]
+        picture = Image.new("RGB", (size * len(row), size + _HEAD), "white")
+        picture.paste(Image.fromarray(np.hstack(row)), (0, _HEAD))
+        for column, recording in enumerate(recordings):
+            label = f"{recording.label}: {recording.origin}"
+            ImageDraw.Draw(picture).text((size * column + 6, 4), label, "black", font_size=13)
+        pictures.append(picture)
     with replacing(path) as draft:
-        Image.open(full).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE).save(
-            draft, optimize=True
+        pictures[0].save(
+            draft,
+            save_all=True,
+            append_images=pictures[1:],
+            duration=round(1000 / RENDER_FPS),
+            loop=0,
+            quality=60,
+            method=6,  # slow and small
         )
 
 
@@ -116,7 +110,7 @@ def _title(recording: Recording) -> str:
     return f"{recording.label}\n{recording.origin}"
 
 
-def _draw_world(axes: Axes, moment: Moment) -> None:
+def _draw_samples(axes: Axes, moment: Moment) -> None:
     from matplotlib.patches import Polygon
 
     x, y, angle = moment.body
@@ -125,20 +119,8 @@ def _draw_world(axes: Axes, moment: Moment) -> None:
     axes.add_patch(Polygon(corners, facecolor="#e4e4e4", edgecolor="#555555", linewidth=0.8))
     axes.set(xlim=(-_VIEW, _VIEW), ylim=(-_VIEW, _VIEW), aspect="equal", xticks=[], yticks=[])
     axes.spines[:].set_color("#dddddd")
-
-
-def _around_fingers(moment: Moment, targets: np.ndarray) -> np.ndarray:
-    """Move targets (..., 4, 2) from their mean to the fingers.
-
-    Fingers that press hard all have their targets in the middle of the square, on top of each
-    other.
-    """
-    return moment.fingers + targets - moment.mean
-
-
-def _draw_samples(axes: Axes, moment: Moment) -> None:
-    _draw_world(axes, moment)
-    dots = _around_fingers(moment, moment.samples[:N_SHOWN])
+    # Around the fingers: those that press hard all have their targets in the middle of the square.
+    dots = moment.fingers + moment.samples[:N_SHOWN] - moment.samples.mean(0)
     own, others = moment.joint_movement()
     for k, start in enumerate(moment.starts):
         x, y = dots[:, k].T
@@ -160,19 +142,9 @@ def _draw_paths(axes: Axes, recording: Recording) -> None:
         reached = np.flatnonzero(~np.isnan(path))
         if dropped and len(reached):
             last = reached[-1]
-            axes.plot(seconds[last], path[last], "x", color=_RIGHT, markersize=5)
+            axes.plot(seconds[last], path[last], "x", color=_LOST, markersize=5)
     axes.set_title(f"standard deviation of x {recording.x_std:.3f}", fontsize=8)
     axes.set_xlabel("seconds after the warm-up", fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(alpha=0.25, linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _draw_step(axes: Axes, moment: Moment) -> None:
-    _draw_world(axes, moment)
-    x, y = _around_fingers(moment, moment.samples[:N_SHOWN]).reshape(-1, 2).T
-    axes.scatter(x, y, s=1.5, color="#999999", linewidths=0, zorder=3)
-    moved = 2 * (moment.chosen - moment.mean)
-    arrow: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 4}
-    shades = [_RIGHT if x > 0 else _LEFT for x in moved[:, 0]]
-    axes.quiver(*moment.fingers.T, *moved.T, color=shades, width=0.018, headwidth=3.5, **arrow)

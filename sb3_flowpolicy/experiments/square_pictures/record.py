@@ -33,23 +33,14 @@ class Moment(NamedTuple):
         half: Half the edge of the square.
         fingers: Positions of the fingers: right, top, left, bottom, (4, 2).
         starts: Centers of the boxes that the fingers reach, (4, 2).
-        reach: Half the edge of these boxes.
         samples: Targets of N sampled actions, (N, 4, 2).
-        chosen: Targets of the action that was taken, itself sampled, (4, 2).
     """
 
     body: np.ndarray
     half: float
     fingers: np.ndarray
     starts: np.ndarray
-    reach: float
     samples: np.ndarray
-    chosen: np.ndarray
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Mean of the sampled targets, (4, 2)."""
-        return self.samples.mean(0)
 
     def joint_movement(self) -> tuple[np.ndarray, np.ndarray]:
         """Find the movement that the fingers share most, and each finger's part in it.
@@ -77,7 +68,7 @@ class Recording(NamedTuple):
     Attributes:
         label: Name of the agent.
         origin: Its seed and steps of training.
-        moments: Steps of one episode after the warm-up.
+        moment: First state of one episode after the warm-up.
         frames: Pictures of the same episode from a second before, (size, size, 3) each.
         paths: x of the square after the warm-up in E sampled episodes of up to T steps, NaN
             once they have ended, (E, T).
@@ -89,7 +80,7 @@ class Recording(NamedTuple):
 
     label: str
     origin: str
-    moments: list[Moment]
+    moment: Moment
     frames: list[np.ndarray]
     paths: np.ndarray
     dropped: np.ndarray
@@ -145,65 +136,59 @@ def record(label: str, model: SACFlow, env_id: str, seed: int, n_episodes: int) 
     kind = "tuning seed" if model.seed is not None and model.seed >= 100 else "seed"
     origin = f"{kind} {model.seed}, {model.num_timesteps:,} steps"
     with own_random_numbers(seed, 0):
-        episodes: list[tuple[list[Moment], list[np.ndarray]]] = []
+        shown: tuple[Moment, list[np.ndarray]] | None = None
         for k in range(ATTEMPTS):
-            moments, frames, lost = _episode(model, env_id, seed + k)
-            if moments:
-                episodes.insert(len(episodes) if lost else 0, (moments, frames))
+            moment, frames, lost = _episode(model, env_id, seed + k)
+            if moment is not None and (shown is None or not lost):
+                shown = moment, frames
             if not lost:
                 break
     with own_random_numbers(seed, 1) as rng:
         paths, dropped, states = _paths(model, env_id, seed + ATTEMPTS, n_episodes)
-        if not episodes or not len(states):
+        if shown is None or not len(states):
             raise ValueError(f"{label} must get through the warm-up, but breaks a finger before")
         chosen = rng.choice(len(states), min(MEASURED_STATES, len(states)), replace=False)
         obs = th.as_tensor(states[chosen])
         assert isinstance(model.actor, FlowActor)
         correlation = model.actor.action_correlation(obs, MEASURED_SAMPLES).abs().mean(0)
         entropy = model.actor.entropy(obs, MEASURED_SAMPLES).mean().item()
-    moments, frames = episodes[0]
-    return Recording(label, origin, moments, frames, paths, dropped, correlation.numpy(), entropy)
+    return Recording(label, origin, *shown, paths, dropped, correlation.numpy(), entropy)
 
 
-def _episode(model: SACFlow, env_id: str, seed: int) -> tuple[list[Moment], list[np.ndarray], bool]:
+def _episode(
+    model: SACFlow, env_id: str, seed: int
+) -> tuple[Moment | None, list[np.ndarray], bool]:
     """Return what is drawn of one episode, and whether the square was lost."""
     env = gym.make(env_id, render_mode="rgb_array", render_size=FILM_SIZE)
     square: Any = env.unwrapped
     warm = int(square.config.warm_steps)
     obs, _ = env.reset(seed=seed)
-    moments, frames = [], []
+    moment, frames = None, []
     step, terminated, truncated = 0, False, False
     while not (terminated or truncated):
         samples, _ = model.predict(np.repeat(obs[None], N_SAMPLES, axis=0))
         action, _ = model.predict(obs, deterministic=step < warm)
-        if step >= warm:
-            moments.append(_moment(square.get_state(), samples, action))
+        if step == warm:
+            moment = _moment(square.get_state(), samples)
         if step >= warm - FILM_LEAD:
             square.set_action_samples(samples[:N_SHOWN])
-            frames.append(_frame(env))
+            frames.append(env.render())
         obs, _, terminated, truncated, _ = env.step(action)
         step += 1
     square.set_action_samples(None)
-    frames.append(_frame(env))
+    frames.append(env.render())
     env.close()
-    return moments, frames, terminated
+    return moment, frames, terminated  # type: ignore[return-value]
 
 
-def _frame(env: gym.Env) -> np.ndarray:
-    frame: Any = env.render()
-    return frame
-
-
-def _moment(state: dict[str, Any], samples: np.ndarray, action: np.ndarray) -> Moment:
-    starts, reach = state["starts"], float(state["constants"][kernels.REACH])
+def _moment(state: dict[str, Any], samples: np.ndarray) -> Moment:
+    reach = float(state["constants"][kernels.REACH])
     return Moment(
         body=state["bodies"][:3],
         half=float(state["constants"][kernels.HALF_SIDE]),
         fingers=state["fingers"],
-        starts=starts,
-        reach=reach,
-        samples=starts + reach * samples.reshape(-1, 4, 2),
-        chosen=starts + reach * action.reshape(4, 2),
+        starts=state["starts"],
+        samples=state["starts"] + reach * samples.reshape(-1, 4, 2),
     )
 
 
