@@ -9,15 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import rl_zoo3
-import yaml
-from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_flowpolicy.experiments.standard_tasks import __main__ as command
 from sb3_flowpolicy.experiments.standard_tasks import rule, tasks, training
-
-_OF_GSDE = ("use_sde", "sde_sample_freq", "use_expln", "log_std_init")
 
 
 @pytest.fixture
@@ -26,7 +21,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     few |= {"policy_kwargs": {"net_arch": [8]}}
     rollout = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "normalize": True}
     settings = {"sac": few, "tqc": few, "crossq": few, "ppo": rollout}
-    task = tasks.TASKS["tunnel-2"]._replace(steps=dict.fromkeys(settings, 100), settings=settings)
+    steps = dict.fromkeys(settings, 100)
+    task = tasks.TASKS["tunnel-2"]._replace(steps=steps, own_settings=settings)
     monkeypatch.setitem(tasks.TASKS, "tunnel-2", task)
     monkeypatch.setattr(training, "_TESTS", 2)
 
@@ -66,22 +62,19 @@ def test_mistakes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         assert re.search(message, capsys.readouterr().err)
 
 
-@pytest.mark.parametrize("name", ["half-cheetah", "hopper", "walker"])
-@pytest.mark.parametrize("algorithm", ["sac", "tqc", "crossq", "ppo"])
-def test_settings_are_those_of_rl_zoo3_without_gsde(name: str, algorithm: str) -> None:
-    file = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algorithm}.yml"
-    task = tasks.TASKS[name]
-    published = yaml.safe_load(file.read_text())[task.env_id]
-    published["policy_kwargs"] = eval(published["policy_kwargs"], {"nn": nn, "dict": dict})
-    for settings in (published, published["policy_kwargs"]):
-        for unused in (*_OF_GSDE, "policy", "n_timesteps"):
-            settings.pop(unused, None)
-    ours = {"policy_kwargs": {}, **task.settings[algorithm]}
-    for key, value in ours.items():
-        if isinstance(value, LinearSchedule):
-            assert published[key] == f"lin_{value.start:g}".replace("0.00073", "7.3e-4")
-            published[key] = value
-    assert ours == published
+def test_settings_are_those_of_rl_zoo3_without_gsde() -> None:
+    tqc, ppo = (tasks.TASKS["hopper"].settings(algorithm) for algorithm in ("tqc", "ppo"))
+    assert tqc["learning_rate"](0.5) == 7.3e-4 / 2
+    assert (tqc["batch_size"], tqc["top_quantiles_to_drop_per_net"]) == (256, 5)
+    assert tqc["policy_kwargs"] == {"net_arch": [400, 300]}
+    assert (ppo["n_envs"], ppo["normalize"], ppo["clip_range"](1.0)) == (16, True, 0.4)
+    assert ppo["policy_kwargs"]["activation_fn"] is nn.ReLU
+    for task in ("half-cheetah", "hopper", "walker"):
+        for algorithm in tasks.CANDIDATES:
+            settings = tasks.TASKS[task].settings(algorithm)
+            assert not {"policy", "n_timesteps"} & settings.keys()
+            for name in ("use_sde", "sde_sample_freq", "use_expln", "log_std_init"):
+                assert name not in {**settings, **settings["policy_kwargs"]}
 
 
 def test_the_rule_tells_worse_from_not_worse() -> None:

@@ -57,13 +57,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for path in args.csv[0 if args.task is None else 1 :]:
         if not path.exists():
             parser.error(f"--csv must name files with results, got {path}")
-    tables = [pd.read_csv(path) for path in args.csv if path.exists()]
-    for path, one in zip([path for path in args.csv if path.exists()], tables, strict=True):
-        if list(one) != COLUMNS:
+    tables = {path: pd.read_csv(path) for path in args.csv if path.exists()}
+    for path, table in tables.items():
+        if list(table) != COLUMNS:
             parser.error(f"--csv must name files with the columns {COLUMNS}, got {path}")
-    mine = tables[:1] if args.csv[0].exists() else []
     done = {
-        run for table in tables for run in table[COLUMNS[:4]].itertuples(index=False, name=None)
+        run
+        for table in tables.values()
+        for run in table[COLUMNS[:4]].itertuples(index=False, name=None)
     }
     runs = []
     if args.task is not None:
@@ -81,11 +82,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for task, algorithm, name, seed in tqdm([run for run in runs if run not in done]):
         found = training.train(TASKS[task], algorithm, name, seed, args.episodes)
         rows = [(task, algorithm, name, seed, *row) for row in found]
-        tables.append(pd.DataFrame(rows, columns=COLUMNS))
-        mine.append(tables[-1])
+        table = pd.concat([tables.get(args.csv[0]), pd.DataFrame(rows, columns=COLUMNS)])
         with replacing(args.csv[0]) as draft:
-            pd.concat(mine).to_csv(draft, index=False)
-    table = pd.concat(tables)
+            table.to_csv(draft, index=False)
+        tables[args.csv[0]] = table
+    table = pd.concat(tables.values())
     print(rule.summary(table))
     if args.figure is not None:
         rule.save_figure(table, args.figure)

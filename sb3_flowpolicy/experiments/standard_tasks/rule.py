@@ -11,6 +11,9 @@ import pandas as pd
 from scipy.stats import ttest_ind
 
 from sb3_flowpolicy.common.statistics import Estimate
+from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.experiments.figures import draw_seeds
+from sb3_flowpolicy.experiments.tables import markdown
 
 RULE = """\
 The final value of a run is the mean return of its last two tests, or the share of successes where
@@ -63,10 +66,7 @@ def verdict(found: Estimate) -> str:
 
 def summary(table: pd.DataFrame) -> str:
     """Return the results as a Markdown table, with all seeds."""
-    lines = [
-        "| task | algorithm | policy | final value | against stock | verdict | seeds |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     has_goal = table.groupby(["task", "algorithm"])["test_success"].count() > 0
     for (task, algorithm), group in finals(table).groupby(level=[0, 1], sort=False):
         runs = {name: returns.to_numpy() for name, returns in group.groupby(level=2, sort=False)}
@@ -80,26 +80,21 @@ def summary(table: pd.DataFrame) -> str:
                 enough = min(len(returns), len(stock)) >= _FEWEST_SEEDS
                 judged = verdict(found) if enough else "undecided"
             each = ", ".join(f"{value:.3g}" for value in returns)
-            cells = (task, algorithm, name, f"{returns.mean():.3g}", against, judged, each)
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            rows.append((task, algorithm, name, f"{returns.mean():.3g}", against, judged, each))
+    head = ("task", "algorithm", "policy", "final value", "against stock", "verdict", "seeds")
+    return markdown(pd.DataFrame(rows, columns=head))
 
 
 def save_figure(table: pd.DataFrame, path: Path) -> None:
     """Draw the curves of all seeds, one panel per task and algorithm."""
-    from matplotlib.figure import Figure
-
     groups: Sequence[Any] = list(table.groupby(["task", "algorithm"], sort=False))
-    figure = Figure(figsize=(5 * len(groups), 3.6), layout="constrained")
-    for axes, ((task, algorithm), group) in zip(
-        figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True
-    ):
+    figure = new_figure(5 * len(groups), 3.6)
+    panels = figure.subplots(1, len(groups), squeeze=False)[0]
+    for axes, ((task, algorithm), group) in zip(panels, groups, strict=True):
         for k, (name, runs) in enumerate(group.groupby("policy", sort=False)):
-            shade = "black" if name == "stock" else f"C{k}"
             scores = runs.assign(score=runs["test_success"].fillna(runs["test_return"]))
             curves = scores.pivot_table(index="step", columns="seed", values="score")
-            axes.plot(curves.index, curves, color=shade, linewidth=0.6, alpha=0.5)
-            axes.plot(curves.index, curves.mean(axis=1), color=shade, linewidth=2, label=name)
+            draw_seeds(axes, curves, "black" if name == "stock" else f"C{k}", name)
         axes.set(
             title=f"{algorithm} on {task}",
             xlabel="environment steps",

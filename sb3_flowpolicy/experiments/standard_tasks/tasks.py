@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from typing import Any, NamedTuple
 
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.utils import LinearSchedule
-from torch import nn
+from torch import nn  # noqa: F401, rl_zoo3's files name it
 
 from sb3_flowpolicy.algorithms.crossq_flow import CrossQFlow
 from sb3_flowpolicy.algorithms.ppo_flow import PPOFlow
@@ -23,8 +25,14 @@ class Candidate(NamedTuple):
     policy_kwargs: dict[str, Any]
 
 
+_UNUSED = {
+    *("policy", "n_timesteps"),
+    *("use_sde", "sde_sample_freq", "use_expln", "log_std_init"),  # gSDE
+}
+
+
 class Task(NamedTuple):
-    """An environment, and per algorithm the number of steps and the settings of all candidates.
+    """An environment, the number of steps per algorithm, and the settings of all candidates.
 
     Two settings are not arguments of the algorithm: ``n_envs`` and ``normalize``, for rl_zoo3's
     ``VecNormalize``.
@@ -32,8 +40,32 @@ class Task(NamedTuple):
 
     env_id: str
     steps: dict[str, int]
-    settings: dict[str, dict[str, Any]]
-    env_kwargs: dict[str, Any]
+    env_kwargs: dict[str, Any] | None = None
+    own_settings: dict[str, dict[str, Any]] | None = None
+
+    def settings(self, algorithm: str) -> dict[str, Any]:
+        """Return the task's own settings, or those that rl_zoo3 publishes, without gSDE.
+
+        gSDE is not a density; ``log_std_init`` goes with it.
+        """
+        if self.own_settings is not None:
+            return dict(self.own_settings[algorithm])
+        files = resources.files("rl_zoo3") / "hyperparams"
+        published = yaml.safe_load((files / f"{algorithm}.yml").read_text())[self.env_id]
+        policy_kwargs = eval(published.pop("policy_kwargs", "{}"))
+        unused = (
+            "policy",
+            "n_timesteps",
+            "use_sde",
+            "sde_sample_freq",
+            "use_expln",
+            "log_std_init",
+        )
+        settings, policy_kwargs = (
+            {name: value for name, value in given.items() if name not in unused}
+            for given in (published, policy_kwargs)
+        )
+        return ExperimentManager._preprocess_schedules(settings) | {"policy_kwargs": policy_kwargs}
 
 
 def _candidates(stock: Any, ours: Any, **more: Candidate) -> dict[str, Candidate]:
@@ -59,74 +91,17 @@ CANDIDATES: dict[str, dict[str, Candidate]] = {
 }
 """Algorithm -> name -> candidate; "stock" is the algorithm with its own policy."""
 
-# rl_zoo3 2.9.2's settings for PyBullet's tasks, without gSDE, which is not a density: without
-# use_sde, sde_sample_freq, use_expln, and the log_std_init that goes with it. A test compares them.
-_PPO = {
-    "normalize": True,
-    "n_envs": 16,
-    "n_steps": 512,
-    "batch_size": 128,
-    "n_epochs": 20,
-    "gamma": 0.99,
-    "gae_lambda": 0.9,
-    "ent_coef": 0.0,
-    "vf_coef": 0.5,
-    "max_grad_norm": 0.5,
-    "learning_rate": 3e-5,
-    "clip_range": 0.4,
-    "policy_kwargs": {
-        "ortho_init": False,
-        "activation_fn": nn.ReLU,
-        "net_arch": {"pi": [256, 256], "vf": [256, 256]},
-    },
-}
-_PPO_LINEAR = {**_PPO, "clip_range": LinearSchedule(0.4, 0.0, 1.0)}
-_CROSSQ = {
-    "learning_rate": 7.3e-4,
-    "buffer_size": 300_000,
-    "batch_size": 256,
-    "ent_coef": "auto",
-    "gamma": 0.98,
-    "train_freq": 8,
-    "gradient_steps": 8,
-    "learning_starts": 10_000,
-}
-_SAC = {**_CROSSQ, "tau": 0.02, "policy_kwargs": {"net_arch": [400, 300]}}
-_LINEAR = {"learning_rate": LinearSchedule(7.3e-4, 0.0, 1.0)}
 _STEPS = {"sac": 300_000, "tqc": 100_000, "crossq": 100_000, "ppo": 500_000}
-_HOPPER = {
-    "sac": {**_SAC, **_LINEAR},
-    "tqc": {**_SAC, **_LINEAR, "top_quantiles_to_drop_per_net": 5},
-    "crossq": {**_CROSSQ, **_LINEAR},
-    "ppo": _PPO_LINEAR,
-}
-_WALKER = {**_HOPPER, "tqc": {**_SAC, **_LINEAR}}
-_CHEETAH = {"sac": _SAC, "tqc": _SAC, "crossq": _CROSSQ, "ppo": _PPO}
 
 TASKS: dict[str, Task] = {
-    "half-cheetah": Task("HalfCheetahBulletEnv-v0", _STEPS, _CHEETAH, {}),
-    "hopper": Task("HopperBulletEnv-v0", _STEPS, _HOPPER, {}),
-    "walker": Task("Walker2DBulletEnv-v0", _STEPS, _WALKER, {}),
-    # Our own settings with small networks, for a quick look.
-    "half-cheetah-quick": Task(
-        "HalfCheetahBulletEnv-v0",
-        {"ppo": 150_000},
-        {
-            "ppo": {
-                "normalize": True,
-                "n_envs": 8,
-                "n_steps": 512,
-                "batch_size": 128,
-                "gae_lambda": 0.9,
-                "policy_kwargs": {"net_arch": [64, 64]},
-            }
-        },
-        {},
-    ),
+    "half-cheetah": Task("HalfCheetahBulletEnv-v0", _STEPS),
+    "hopper": Task("HopperBulletEnv-v0", _STEPS),
+    "walker": Task("Walker2DBulletEnv-v0", _STEPS),
     # Only coordinated actions are safe here.
     "tunnel-2": Task(
         "TunnelDiagonal-v0",
         {"ppo": 120_000},
+        {"total_dims": 2, "coupled_dims": 2},
         {
             "ppo": {
                 "n_envs": 8,
@@ -140,7 +115,6 @@ TASKS: dict[str, Task] = {
                 "policy_kwargs": {"net_arch": [32, 32]},
             },
         },
-        {"total_dims": 2, "coupled_dims": 2},
     ),
 }
 """Name -> task."""

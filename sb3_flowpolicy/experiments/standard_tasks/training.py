@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
-import warnings
-from importlib import import_module
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.standard_tasks.tasks import CANDIDATES, Task
+from sb3_flowpolicy.experiments.work import register_env
 
 _TESTS = 10
 
@@ -34,11 +33,8 @@ def train(task: Task, algorithm: str, name: str, seed: int, episodes: int) -> li
         Step, mean return, share of successes (NaN if the task has none), and seconds since the
         start, per test.
     """
-    if "Bullet" in task.env_id:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # pybullet's bindings warn about SWIG types
-            import_module("pybullet_envs_gymnasium")
-    candidate, settings = CANDIDATES[algorithm][name], dict(task.settings[algorithm])
+    register_env(task.env_id)
+    candidate, settings = CANDIDATES[algorithm][name], task.settings(algorithm)
     count, normalize = settings.pop("n_envs", 1), settings.pop("normalize", False)
     settings["policy_kwargs"] = {**settings.get("policy_kwargs", {}), **candidate.policy_kwargs}
     venv: VecEnv = make_vec_env(task.env_id, count, seed, env_kwargs=task.env_kwargs)
@@ -47,42 +43,26 @@ def train(task: Task, algorithm: str, name: str, seed: int, episodes: int) -> li
         venv = VecNormalize(venv, gamma=settings.get("gamma", 0.99))
         test_venv = VecNormalize(test_venv, training=False, norm_reward=False)
     model = candidate.algorithm(candidate.policy, venv, seed=seed, device="cpu", **settings)
-    tests = _Tests(test_venv, episodes)
-    # One call, because schedules follow the progress of a call.
-    steps = task.steps[algorithm]
-    model.learn(steps, callback=EveryNTimesteps(max(1, steps // _TESTS), tests))
-    if len(tests.rows) < _TESTS:
-        tests.test(model)
-    venv.close()
-    test_venv.close()
-    return tests.rows
+    steps, started, seconds = task.steps[algorithm], time.perf_counter(), []
 
-
-class _Tests(BaseCallback):
-    """Tests the model whenever it is called."""
-
-    def __init__(self, venv: VecEnv, episodes: int) -> None:
-        super().__init__()
-        self.venv, self.episodes = venv, episodes
-        self.rows: list[tuple[Any, ...]] = []
-        self._started = time.perf_counter()
-
-    def _on_step(self) -> bool:
-        self.test(self.model)
+    def note_time(*_: Any) -> bool:
+        seconds.append(round(time.perf_counter() - started))
         return True
 
-    def test(self, model: Any) -> None:
-        """Append a row."""
-        if isinstance(self.venv, VecNormalize):
-            sync_envs_normalization(model.get_env(), self.venv)
-        successes: list[bool] = []
-
-        def note(local: dict[str, Any], _: dict[str, Any]) -> None:
-            if local["done"] and "is_success" in local["info"]:
-                successes.append(bool(local["info"]["is_success"]))
-
-        mean_return, _ = evaluate_policy(model, self.venv, self.episodes, callback=note)
-        assert isinstance(mean_return, float)
-        success = float(np.mean(successes)) if successes else math.nan
-        seconds = round(time.perf_counter() - self._started)
-        self.rows.append((model.num_timesteps, round(mean_return, 2), success, seconds))
+    with tempfile.TemporaryDirectory() as folder:  # without one, EvalCallback keeps only the last
+        tests = EvalCallback(
+            test_venv,
+            callback_after_eval=ConvertCallback(note_time),
+            n_eval_episodes=episodes,
+            eval_freq=max(1, steps // _TESTS // count),
+            log_path=folder,
+            verbose=0,
+        )
+        # One call, because schedules follow the progress of a call.
+        model.learn(steps, callback=tests)
+    venv.close()
+    test_venv.close()
+    returns = [round(float(np.mean(episodes)), 2) for episodes in tests.evaluations_results]
+    successes = [float(np.mean(one)) for one in tests.evaluations_successes]
+    successes = successes or [math.nan] * len(returns)
+    return list(zip(tests.evaluations_timesteps, returns, successes, seconds, strict=True))
