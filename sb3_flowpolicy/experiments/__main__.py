@@ -12,8 +12,7 @@ from pathlib import Path
 
 from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
-from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
+from sb3_flowpolicy.experiments.runner import Progress, results_folder, run_local, unfinished
 from sb3_flowpolicy.experiments.work import (
     FIRST_SEED,
     QUICK_SEEDS,

@@ -25,18 +25,9 @@ COLUMNS = ("env", "ent_coef", "seed", "step", "way", "success", "return")
 def compare(
     env: str, seeds: Sequence[int], steps: int, every: int, episodes: int, **overrides: Any
 ) -> list[dict[str, object]]:
-    """Train ``sac_flow`` and test each agent in each way of acting.
+    """Train ``sac_flow`` and test each agent in each way of acting: rows of ``COLUMNS``.
 
-    Args:
-        env: Environment that reports success.
-        seeds: Seeds of the agents.
-        steps: Steps per agent.
-        every: Steps between two tests.
-        episodes: Episodes per test.
-        **overrides: Override the hyperparameter file.
-
-    Returns:
-        One row per test, agent and way, see ``COLUMNS``.
+    ``overrides`` go before the hyperparameter file. The environment has to report success.
     """
     settings = {**load_hyperparameters("sac_flow", env), **overrides}
     del settings["n_timesteps"]

@@ -51,14 +51,12 @@ class Setting:
         name: Name in commands and file names.
         env_id: Registered environment.
         env_kwargs: Arguments in which the environment differs from its registration.
-        block: Block of ``zoo_hyperparams``. Default: that of ``env_id``.
-        overrides: What differs from the block, for all agents.
+        overrides: What differs from the environment's block of ``zoo_hyperparams``, for all agents.
     """
 
     name: str
     env_id: str
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    block: str | None = None
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -98,7 +96,6 @@ class Experiment:
         steps: Environment steps per seed.
         seeds: Number of seeds; they are 1, 2, ...
         eval_every: Steps between two measurements.
-        test_episodes: Deterministic episodes per seed and measurement.
         measures: Names of further measurements, see ``measures.py``.
         pictures_at: When to record the first seed's policy along an episode, as shares of
             ``steps``; only on two-dimensional Tunnels.
@@ -116,7 +113,6 @@ class Experiment:
     steps: int = 60_000
     seeds: int = 10
     eval_every: int = 1000
-    test_episodes: int = 10
     measures: tuple[str, ...] = ()
     pictures_at: tuple[float, ...] = ()
     notes: str = ""

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_flowpolicy.common.files import replacing
-from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.runner import ONE_THREAD
+from sb3_flowpolicy.experiments.runner import ONE_THREAD, Progress
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import WorkItem
 
@@ -26,14 +25,10 @@ _POLL_SECONDS = 0.5
 def run_on_ray(
     folder: Path, items: Sequence[WorkItem], progress: Progress, address: str | None = None
 ) -> None:
-    """Do items as Ray tasks.
+    """Do items as Ray tasks; only this machine needs access to the folder, which has to be claimed.
 
-    Args:
-        folder: Folder of the experiment, claimed; only this machine needs access to it.
-        items: The items to do.
-        progress: Bar to update.
-        address: Cluster to join. Default: the one that this process is connected to, that of the
-            variable ``RAY_ADDRESS``, or a new one on this machine alone.
+    The cluster is that of ``address``, else the one that this process is connected to, that of the
+    variable ``RAY_ADDRESS``, or a new one on this machine alone.
 
     Raises:
         ModuleNotFoundError: If Ray is missing.

@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import base64
+import functools
+import io
+import json
 import shutil
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from sb3_flowpolicy.common.files import write_text
-from sb3_flowpolicy.experiments.experiment import NOT_MEASURED
-from sb3_flowpolicy.experiments.section import METHOD, Section, png, read_results
-from sb3_flowpolicy.experiments.tables import markdown
+from sb3_flowpolicy.common.statistics import RESAMPLES, RESAMPLES_OF_PAIRS
+from sb3_flowpolicy.experiments import evidence as definitions
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.experiment import (
+    NOT_MEASURED,
+    NOT_REPRODUCED,
+    PARTLY,
+    REPRODUCED,
+    Experiment,
+)
+from sb3_flowpolicy.experiments.figures import (
+    SMOOTHED_OVER,
+    curves_figure,
+    outcomes_figure,
+    panels,
+    profile_figure,
+)
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
+from sb3_flowpolicy.experiments.policy_pictures import policies_figure
+from sb3_flowpolicy.experiments.store import differences
+from sb3_flowpolicy.experiments.tables import facts, markdown, results_table
+from sb3_flowpolicy.experiments.work import FIRST_SEED, in_words, make_plan, plan_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,6 +50,131 @@ makes an interactive page from them.
 
 **How to read this.** {method}
 """
+
+METHOD = (
+    "Every seed is drawn and counted; none is dropped. Numbers are interquartile means over seeds "
+    "with 95 % stratified bootstrap intervals in brackets (rliable, "
+    f"{RESAMPLES} resamples, {RESAMPLES_OF_PAIRS} for probabilities of improvement). "
+    f"Test episodes are deterministic, at least ten per seed and measurement; on a tunnel, whose "
+    "start is fixed, they are all the same episode. Training numbers average the episodes that "
+    "ended since the last measurement, entropies 256 states of the replay buffer. "
+    f"'Final' is the mean over the last {definitions.FINAL_SHARE:.0%} of the measurements. A seed "
+    f"has solved its task 'at the end' if its final test success is at least "
+    f"{definitions.SOLVED:.0%}, 'at its best' if {definitions.IN_A_ROW} measurements in a row "
+    "average that; a seed that never does counts with the length of training in 'steps until "
+    f"solved'. Oscillations are counted as swings of at least "
+    f"{definitions.OSCILLATIONS['train_return']:.0%} of the highest test return in training "
+    f"return, {definitions.OSCILLATIONS['entropy']:g} nats in entropy and "
+    f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the entropy coefficient, "
+    "from the first training success on; the curve with the fewest decides. Logs of unequal "
+    "length are interpolated to a common grid that ends with the shortest. "
+    f"Curves are drawn as means over {SMOOTHED_OVER} measurements. A claim is reproduced if all "
+    "lines of its rule hold, not reproduced if none does, partly reproduced otherwise. Our own "
+    "experiments have no claim to reproduce; each line of their rules describes one agent."
+)
+
+_OURS_IN_WORDS = {
+    REPRODUCED: "all lines hold",
+    PARTLY: "some lines hold",
+    NOT_REPRODUCED: "no line holds",
+}
+
+
+class Section:
+    """Verdict, tables and figures of one experiment."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence, self.experiment = evidence, evidence.experiment
+        self.verdict, findings = evidence.judge()
+        self.measured = bool(evidence.measured)
+        self.table = results_table(evidence) if self.measured else None
+        self.facts = facts(evidence)
+        self.missing = what_is_missing(self.experiment)
+        self.estimate = in_words(plan_seconds(make_plan(self.experiment), 2))
+        # Trials must not be taken for results.
+        self.reservation = (
+            reservation(self.experiment, evidence.settings) if evidence.items else None
+        )
+        marks = {True: "holds", False: "fails", None: "open"}
+        rule = [
+            (check.statement, marks[finding.holds], finding.measured)
+            for check, finding in zip(self.experiment.checks, findings, strict=True)
+        ]
+        self.rule = pd.DataFrame(rule, columns=["rule", "", "measured"])
+
+    @property
+    def verdict_in_words(self) -> str:
+        """The verdict and its reservation; our own experiments have no claim to reproduce."""
+        ours = self.experiment.source == "ours"
+        verdict = _OURS_IN_WORDS.get(self.verdict, self.verdict) if ours else self.verdict
+        return verdict + (f" ({self.reservation})" if self.reservation else "")
+
+    def plots(self) -> list[tuple[str, list[str]]]:
+        """Return the interactive plots as JSON, grouped by setting."""
+        from sb3_flowpolicy.experiments.plots import curves_plot, profile_plot
+
+        if not self.measured:
+            return []
+        groups, metrics = [], panels(self.evidence)
+        for setting in self.experiment.settings:
+            figures = [curves_plot(self.evidence, setting.name, metric) for metric in metrics]
+            profile = profile_plot(self.evidence, setting.name)
+            figures += [] if profile is None else [profile]
+            groups.append((setting.name, [_for_html(f.to_json()) for f in figures if f.data]))
+        return groups
+
+    def pictures(self) -> dict[str, Figure]:
+        """Return the still pictures by name."""
+        if not self.measured:
+            return {}
+        found = {
+            "outcomes": outcomes_figure(self.evidence),
+            "curves": curves_figure(self.evidence),
+            "profile": profile_figure(self.evidence),
+            "policies": policies_figure(self.evidence),
+        }
+        return {name: figure for name, figure in found.items() if figure is not None}
+
+
+def reservation(experiment: Experiment, settings: Mapping[str, Any]) -> str | None:
+    """Explain why results with these settings are not the experiment's own, None if they are."""
+    planned = make_plan(experiment)
+    seeds = settings["seeds"]
+    if settings["steps"] < planned.steps or len(seeds) < len(planned.seeds):
+        return "trial, not a result"
+    if seeds[0] != FIRST_SEED:
+        return f"seeds from {seeds[0]} on, which are for tuning: not a result"
+    together = max(len(item["seeds"]) for item in settings["items"].values())
+    same = make_plan(experiment, steps=settings["steps"], seeds=len(seeds), seeds_per_item=together)
+    wanted = json.loads(json.dumps(same.settings()))
+    if settings != wanted:
+        return f"made with other settings ({differences(dict(settings), wanted)[0]})"
+    return None
+
+
+def read_results(results: Path) -> list[Evidence]:
+    """Read the results of all experiments.
+
+    Args:
+        results: Folder that ``run`` wrote.
+
+    Raises:
+        ValueError: If the folder holds no results, or a file is corrupt.
+    """
+
+    @functools.cache
+    def one(name: str) -> Evidence | None:
+        if name not in EXPERIMENTS:
+            return None
+        return Evidence(EXPERIMENTS[name], results / name, one)
+
+    found = [evidence for name in EXPERIMENTS if (evidence := one(name)) is not None]
+    if not any(evidence.items for evidence in found):
+        raise ValueError(
+            f"{results} must hold the results of at least one experiment, got none: "
+            "python -m sb3_flowpolicy.experiments run NAME makes some"
+        )
+    return found
 
 
 def write_report(results: Path, page: Path) -> Path:
@@ -115,3 +263,15 @@ def _markdown(section: Section, images: dict[str, str]) -> str:
             "\n".join(f"- {name}: {text}" for name, text in section.facts.items()),
         ]
     return "\n\n".join(filter(None, paragraphs)) + "\n"
+
+
+def png(figure: Any, dpi: int) -> bytes:
+    """Return a figure as the bytes of a PNG file, the same for the same figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=dpi, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _for_html(text: str) -> str:
+    """Keep JSON from closing the element that it stands in."""
+    return text.replace("</", "<\\/")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import queue
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -14,8 +15,8 @@ from typing import Any
 from unittest import mock
 
 from filelock import FileLock, Timeout
+from tqdm import tqdm
 
-from sb3_flowpolicy.experiments.progress import Progress
 from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
 from sb3_flowpolicy.experiments.work import Plan, WorkItem, item_seconds
 
@@ -26,14 +27,7 @@ _reports: Any = None
 
 @contextmanager
 def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
-    """Claim the folder of an experiment for as long as a run lasts.
-
-    Args:
-        out: Folder of all experiments.
-        plan: The plan to run.
-
-    Yields:
-        The experiment's own folder.
+    """Claim the experiment's own folder in ``out`` for as long as a run lasts.
 
     Raises:
         ValueError: If it holds results of other settings, or another run is at work.
@@ -58,14 +52,58 @@ def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
     ]
 
 
-def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
-    """Do items in processes of this machine.
+class Progress:
+    """A bar over the environment steps of all seeds that names the items at work.
 
     Args:
-        folder: Folder of the experiment, claimed.
-        items: The items to do.
-        progress: Bar to update.
-        workers: Number of processes, at least 1.
+        items: All items.
+        finished: Keys of those that were finished before this run.
+        shown: Whether to draw the bar.
+    """
+
+    def __init__(
+        self, items: Sequence[WorkItem], finished: Sequence[str] = (), shown: bool = True
+    ) -> None:
+        self.items = {item.key: item for item in items}
+        self.steps = {key: self.items[key].steps for key in finished}
+        self.bar = tqdm(
+            total=sum(item.steps * len(item.seeds) for item in items),
+            initial=sum(item.steps * len(item.seeds) for item in items if item.key in finished),
+            desc="all",
+            unit=" steps",
+            unit_scale=True,
+            disable=not shown,
+            dynamic_ncols=True,
+        )
+
+    def update(self, key: str, steps: int) -> None:
+        """Note that each seed of an item has done so many steps."""
+        item, known = self.items[key], key in self.steps
+        steps = min(steps, item.steps)
+        gained = (steps - self.steps.get(key, 0)) * len(item.seeds)
+        self.steps[key] = steps
+        if not known and not self.bar.disable:
+            self.bar.initial += gained  # an earlier session's steps are no measure of this speed
+        shares = {name: done / self.items[name].steps for name, done in self.steps.items()}
+        at_work = (f"{name} {share:.0%}" for name, share in shares.items() if share < 1)
+        self.bar.set_postfix_str(", ".join(at_work), False)
+        self.bar.update(gained)
+
+    def take(self, reports: Any) -> None:
+        """Note all reports in a queue: pairs of an item's key and its steps."""
+        while True:
+            try:
+                self.update(*reports.get_nowait())
+            except queue.Empty:
+                return
+
+    def close(self) -> None:
+        """Close the bar."""
+        self.bar.close()
+
+
+def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
+    """Do items in at most ``workers`` processes of this machine; ``folder`` has to be claimed.
 
     Raises:
         ValueError: If an item's files are damaged.

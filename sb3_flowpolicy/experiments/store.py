@@ -48,10 +48,7 @@ _ADVICE = "restore the file, or delete all files of this item and run it again"
 
 
 def read_settings(folder: Path) -> dict[str, Any] | None:
-    """Return the settings of a folder's results, None if it holds none.
-
-    Args:
-        folder: Folder of one experiment, named after it.
+    """Return the settings of an experiment's folder, None if it holds no results.
 
     Raises:
         ValueError: If the file is corrupt, of another version, or of another experiment.
@@ -107,12 +104,7 @@ def differences(found: Any, wanted: Any, where: str = "") -> list[str]:
 
 
 class ItemFiles:
-    """The files of one work item.
-
-    Args:
-        folder: Folder of the experiment.
-        key: The item's key.
-    """
+    """The files of one work item, by its experiment's folder and its key."""
 
     def __init__(self, folder: Path, key: str) -> None:
         self.folder, self.key = folder, key
@@ -159,15 +151,7 @@ class ItemFiles:
         return {"table": len(table), "details": len(details), "sha256": digest}
 
     def check(self, noted: Mapping[str, Any], advice: str) -> None:
-        """Check that the files are as they were at an earlier :meth:`fingerprint`.
-
-        Args:
-            noted: The fingerprint; the ``sha256`` may be missing.
-            advice: What to do if they are not.
-
-        Raises:
-            ValueError: If they have changed.
-        """
+        """Raise ``ValueError``, with this advice, if the files changed since a fingerprint."""
         found = self.fingerprint()
         if any(found[name] != noted[name] for name in found.keys() & noted.keys()):
             raise ValueError(
@@ -226,12 +210,9 @@ class ItemFiles:
     def read_done(self, steps: int, seeds: Sequence[int]) -> dict[str, Any] | None:
         """Return the facts of a finished item, None of an unfinished one.
 
-        Args:
-            steps: Steps that the item must have done.
-            seeds: Seeds that it must have trained.
-
         Raises:
-            ValueError: If a file was changed since, or is another item's.
+            ValueError: If a file was changed since, or is another item's, or it has done fewer
+                steps, or other seeds.
         """
         if not self.finished:
             return None

@@ -17,6 +17,8 @@ from sb3_flowpolicy.experiments.store import SCHEMA
 FIRST_SEED = 1
 SEEDS_PER_ITEM = 10
 QUICK_STEPS, QUICK_SEEDS = 3000, 2
+TEST_EPISODES = 10
+"""Per seed and measurement."""
 # Short runs write this many checkpoints, long ones one per so many steps.
 CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS = 6, 50_000
 
@@ -36,19 +38,15 @@ _START_SECONDS = 40
 class WorkItem:
     """One :class:`SeedBatch` to train: an agent on a setting.
 
+    Its fields are those of :class:`Setting` and :class:`Experiment`, and the entries of an item in
+    ``settings.json``.
+
     Attributes:
         key: Name of its files.
         setting: Name of the setting.
         agent: Name of the agent.
-        seeds: Its seeds.
-        env_id: Environment.
-        env_kwargs: Arguments in which it differs from its registration.
         hyperparameters: Arguments of the agents, ``policy`` among them.
-        steps: Environment steps per seed.
-        eval_every: Steps between two measurements.
         checkpoint_every: Steps between two checkpoints, a multiple of ``eval_every``.
-        test_episodes: Test episodes per seed and measurement.
-        measures: Names of further measurements.
         pictures_at: Steps after which the first seed's policy is recorded.
     """
 
@@ -85,12 +83,18 @@ class Plan:
 
     def settings(self) -> dict[str, Any]:
         """Return everything that results depend on; runs that share a folder agree on it."""
+        items = {}
+        for item in self.items:
+            spec = gym.spec(item.env_id)
+            registration = {"kwargs": spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+            items[item.key] = {**vars(item), "env_registration": registration}
+            del items[item.key]["key"]
         return {
             "schema": SCHEMA,
             "experiment": self.experiment.name,
             "steps": self.steps,
             "seeds": list(self.seeds),
-            "items": {item.key: describe(item) for item in self.items},
+            "items": items,
         }
 
 
@@ -105,7 +109,7 @@ def vary(
         agents: Names of the agents to keep. Default: all.
 
     Raises:
-        ValueError: If there is no such agent, or the environments do not take these arguments.
+        ValueError: If there is no such agent, or an environment does not take these arguments.
     """
     for setting in experiment.settings if env_kwargs else ():
         register_env(setting.env_id)
@@ -113,18 +117,16 @@ def vary(
             gym.make(setting.env_id, **{**setting.env_kwargs, **env_kwargs}).close()
         except TypeError as error:
             raise ValueError(f"--set must name arguments of {setting.env_id}: {error}") from None
-    names = [agent.name for agent in experiment.agents]
+    known = {agent.name: agent for agent in experiment.agents}
     for name in agents or ():
-        if name not in names:
-            raise ValueError(f"agents of {experiment.name} must be among {names}, got {name!r}")
-    return replace(
-        experiment,
-        agents=tuple(one for one in experiment.agents if agents is None or one.name in agents),
-        settings=tuple(
-            replace(setting, env_kwargs={**setting.env_kwargs, **env_kwargs})
-            for setting in experiment.settings
-        ),
+        if name not in known:
+            raise ValueError(f"agents of {experiment.name} must be among {[*known]}, got {name!r}")
+    settings = (
+        replace(setting, env_kwargs={**setting.env_kwargs, **env_kwargs})
+        for setting in experiment.settings
     )
+    chosen = (agent for name, agent in known.items() if agents is None or name in agents)
+    return replace(experiment, agents=tuple(chosen), settings=tuple(settings))
 
 
 def make_plan(
@@ -143,8 +145,8 @@ def make_plan(
         steps: Environment steps per seed. Default: the profile's.
         seeds: Number of seeds. Default: the profile's.
         first_seed: The seeds are this one and those after it.
-        seeds_per_item: How many seeds are trained in one process, at most. Fewer make more items
-            to spread over machines, more make better use of each.
+        seeds_per_item: Most seeds trained in one process: fewer make more items to spread over
+            machines.
     """
     quick = profile == "quick"
     steps = (QUICK_STEPS if quick else experiment.steps) if steps is None else steps
@@ -164,11 +166,11 @@ def _item(
     experiment: Experiment,
     setting: Setting,
     agent: Agent,
-    seeds: Sequence[int],
+    seeds: tuple[int, ...],
     steps: int,
     split: bool,
 ) -> WorkItem:
-    hyperparameters = load_hyperparameters(agent.algo, setting.block or setting.env_id)
+    hyperparameters = load_hyperparameters(agent.algo, setting.env_id)
     hyperparameters.pop("n_timesteps", None)
     for overrides in (setting.overrides, agent.overrides):
         hyperparameters = merge(hyperparameters, overrides)
@@ -179,14 +181,14 @@ def _item(
         key=f"{setting.name}-{agent.name}" + (f"-seeds-{seeds[0]}-{seeds[-1]}" if split else ""),
         setting=setting.name,
         agent=agent.name,
-        seeds=tuple(seeds),
+        seeds=seeds,
         env_id=setting.env_id,
         env_kwargs=dict(setting.env_kwargs),
         hyperparameters=hyperparameters,
         steps=steps,
         eval_every=eval_every,
         checkpoint_every=eval_every * max(1, round(between_checkpoints / eval_every)),
-        test_episodes=experiment.test_episodes,
+        test_episodes=TEST_EPISODES,
         measures=experiment.measures,
         pictures_at=tuple(round(share * steps) for share in experiment.pictures_at),
     )
@@ -207,26 +209,13 @@ def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, An
 
 
 def register_env(env_id: str) -> None:
-    """Register the PyBullet environments if ``env_id`` is one of them.
-
-    Every process that makes environments needs this: registrations do not travel.
+    """Register the PyBullet environments if ``env_id`` is one of them, in this process.
 
     Raises:
         ModuleNotFoundError: If PyBullet is needed and not installed.
     """
     if env_id.endswith("BulletEnv-v0"):
         import pybullet_envs_gymnasium  # noqa: F401
-
-
-def describe(item: WorkItem) -> dict[str, Any]:
-    """Return everything that the item's results depend on."""
-    described = {name: value for name, value in vars(item).items() if name != "key"}
-    spec = gym.spec(item.env_id)
-    described["env_registration"] = {
-        "kwargs": spec.kwargs,
-        "max_episode_steps": spec.max_episode_steps,
-    }
-    return described
 
 
 def environment(item: WorkItem) -> str:

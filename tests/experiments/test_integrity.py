@@ -15,7 +15,7 @@ from sb3_flowpolicy.experiments.__main__ import main
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import GAUSS, NOT_MEASURED, Experiment
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
-from sb3_flowpolicy.experiments.section import reservation
+from sb3_flowpolicy.experiments.report import reservation
 from sb3_flowpolicy.experiments.store import ItemFiles, read_settings
 from sb3_flowpolicy.experiments.work import make_plan
 from tests.experiments.conftest import MakeUp, declare_whole

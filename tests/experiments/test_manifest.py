@@ -40,7 +40,6 @@ def test_entries_are_complete(experiment: Experiment) -> None:
     # Runs of a million steps, and runs of 200 000 with large networks, have fewer seeds.
     least = {"E1": 3, "E7": 5, "E8": 5, "E9": 5, "E10": 3, "E11": 5}.get(experiment.claim, 10)
     assert experiment.seeds >= least
-    assert experiment.test_episodes >= 10
     for check in experiment.checks:
         assert any(check.statement.startswith(f"{name}: ") for name in names)
     if what_is_missing(experiment) is None:

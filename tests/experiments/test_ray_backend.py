@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from sb3_flowpolicy.experiments.experiment import Experiment
-from sb3_flowpolicy.experiments.progress import Progress
-from sb3_flowpolicy.experiments.runner import results_folder, run_local, unfinished
+from sb3_flowpolicy.experiments.runner import Progress, results_folder, run_local, unfinished
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import make_plan
 

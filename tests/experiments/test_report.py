@@ -22,8 +22,7 @@ from sb3_flowpolicy.experiments.experiment import (
 )
 from sb3_flowpolicy.experiments.figures import outcomes_figure
 from sb3_flowpolicy.experiments.manifest import find
-from sb3_flowpolicy.experiments.report import write_docs, write_report
-from sb3_flowpolicy.experiments.section import Section, read_results
+from sb3_flowpolicy.experiments.report import Section, read_results, write_docs, write_report
 from sb3_flowpolicy.experiments.store import ItemFiles
 from tests.experiments.conftest import MakeUp, declare_whole
 

@@ -56,9 +56,8 @@ class Family:
     """A family of noise R z with standard normal z (M,) and covariance R R^T.
 
     Attributes:
-        root: Function from the parameters of the family to R (8, M).
-        start: Function from the parameters (4,) of independent noise to those with which the
-            search of this family begins.
+        root: From the parameters of the family to R (8, M).
+        start: From the parameters (4,) of independent noise to those where the search begins.
         color: Exponent of the spectrum in time: 0 is white, 1 pink.
     """
 
@@ -74,9 +73,8 @@ def _scales(logarithms: Array) -> Array:
 def independent(parameters: Array) -> Array:
     """Return the root of a diagonal covariance.
 
-    Args:
-        parameters: Logarithms of the standard deviations, (4,): normal components along x and y,
-            tangential components along x and y.
+    The parameters (4,) are logarithms of the standard deviations: normal components along x and y,
+    tangential components along x and y.
 
     Example:
         >>> independent(np.log([0.1, 0.2, 0.3, 0.4])).diagonal().round(1).tolist()
@@ -88,9 +86,8 @@ def independent(parameters: Array) -> Array:
 def rank_2(parameters: Array) -> Array:
     """Return the root (8, 10) of diag + V V^T, where V moves all fingers along x and along y.
 
-    Args:
-        parameters: Those of `independent`, and for either column of V how far the fingers move
-            that press along the axis, and the others, (8,).
+    The parameters (8,) are those of `independent`, and for either column of V how far the fingers
+    move that press along the axis, and the others.
     """
     columns = [
         first * MODES[name][0] + second * MODES[name][1]
@@ -104,9 +101,8 @@ def rank_2(parameters: Array) -> Array:
 def full(parameters: Array) -> Array:
     """Return the root of any covariance that suits the symmetry of the tasks.
 
-    Args:
-        parameters: Per pair of modes, the logarithms of two scales and how much the second mode
-            follows the first; then how much joint motion along y follows that along x, (13,).
+    The parameters (13,) are, per pair of modes, the logarithms of two scales and how much the
+    second mode follows the first; then how much joint motion along y follows that along x.
     """
     columns = []
     for (first, second), (log_1, log_2, lean) in zip(

@@ -94,13 +94,7 @@ def setting_of(
     arguments: dict[str, Any] | None = None,
     **options: Any,
 ) -> Setting:
-    """Return the setting of an environment id with other constants.
-
-    Args:
-        env_id: Id of a Square.
-        task: Coefficients of the reward that differ from the id's.
-        arguments: Arguments of the environment that differ from the id's.
-        **options: Arguments of `Setting`.
+    """Return the setting of a Square's id, with other rewards and arguments of the environment.
 
     Raises:
         ValueError: If the id is none of a Square, or a value is out of range.
@@ -124,15 +118,11 @@ def predict(
     names: tuple[str, ...] = tuple(FAMILIES),
     report: Callable[[int], None] | None = None,
 ) -> dict[str, Prediction]:
-    """Search the best policy of each family.
+    """Search the best policy of each family, named as in `FAMILIES`.
 
     A policy presses with a constant mean, plus noise, squashed by tanh. Independent noise is always
-    searched, because the other families begin where it ended.
-
-    Args:
-        setting: What to search.
-        names: Names of `FAMILIES`.
-        report: Called with the number of candidates after each generation.
+    searched, because the other families begin where it ended. ``report`` is called with the number
+    of candidates after each generation.
     """
     batch = SquareBatch(setting.config, setting.episodes)
     final = SquareBatch(setting.config, _FINAL_EPISODES)

@@ -49,9 +49,9 @@ class Moment(NamedTuple):
         shown, so that chance patterns of those that are shown have no part in it.
 
         Returns:
-            own: Along it, each finger's own component in the N_SHOWN samples, (N_SHOWN, 4).
-            others: Sum of the other three fingers' components, (N_SHOWN, 4). Independent fingers
-                have no correlation of own and others.
+            Each finger's component along it in the N_SHOWN samples, and the sum of the other three
+            fingers' components, (N_SHOWN, 4) each. Independent fingers have no correlation of the
+            two.
         """
         fitted = self.samples[N_SHOWN:].reshape(-1, 8)
         # A target that never changes has no part in any movement.
@@ -95,12 +95,7 @@ class Recording(NamedTuple):
 
 
 def load_agent(path: Path, env_id: str) -> SACFlow:
-    """Load a model for a task of the Square.
-
-    Raises:
-        ValueError: If the task is not one of the Square, or the model has another policy, or was
-            trained with other observations or actions.
-    """
+    """Load a model for a task of the Square; raise ``ValueError`` if it does not fit the task."""
     env = gym.make(env_id)
     if not isinstance(env.unwrapped, SquareEnv):
         raise ValueError(f"env must be a task of the Square, such as SquareMoveX-v1, got {env_id}")
@@ -118,10 +113,10 @@ def load_agent(path: Path, env_id: str) -> SACFlow:
 def record(label: str, model: SACFlow, env_id: str, seed: int, n_episodes: int) -> Recording:
     """Play the episodes that the pictures show.
 
-    The episode that is shown step by step is the first of ``ATTEMPTS`` in which the square is not
-    lost, else the first of all. It is deterministic during the warm-up, so that all agents start to
-    explore from similar states, and sampled afterwards. Those for paths and correlation are all
-    kept, whatever their end, and sampled from the start.
+    The episode that is filmed is the first of ``ATTEMPTS`` in which the square is not lost, else
+    the first of all. It is deterministic during the warm-up, so that all agents start to explore
+    from similar states, and sampled afterwards. Those for paths and correlation are all kept,
+    whatever their end, and sampled from the start.
 
     Args:
         label: Name of the agent.
