@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from sb3_flowpolicy.common.files import write_text
-from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
+from sb3_flowpolicy.common.statistics import interquartile_mean
 from sb3_flowpolicy.density.studies import STUDIES, Study
 from sb3_flowpolicy.density.verdicts import CHECKS, sound
 
@@ -114,5 +114,5 @@ def _section(study: Study, folder: Path) -> str:
 
 
 def _interval(values: pd.Series) -> str:
-    mean = bootstrap_interquartile_mean(values.to_numpy(), seed=0)
+    mean = interquartile_mean(values.to_numpy(), seed=0)
     return f"{mean.value:.3f} [{mean.low:.3f}, {mean.high:.3f}]"

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap
 
-from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean, interquartile_mean
+from sb3_flowpolicy.common.statistics import interquartile_mean
 from sb3_flowpolicy.diagnostics.figures import new_figure
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
@@ -103,7 +103,7 @@ def smoothed(curves: pd.DataFrame) -> pd.DataFrame:
 
 def draw_seeds(axes: Axes, curves: pd.DataFrame, shade: str, label: str) -> None:
     """Draw each column thin, their interquartile mean bold, its 95 % interval as a band."""
-    mean = bootstrap_interquartile_mean(curves.to_numpy().T)
+    mean = interquartile_mean(curves.to_numpy().T)
     axes.plot(curves.index, curves, color=shade, linewidth=0.5, alpha=0.35)
     axes.fill_between(curves.index, mean.low, mean.high, color=shade, alpha=0.2, linewidth=0)
     axes.plot(curves.index, mean.value, color=shade, linewidth=2, label=label)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 
-from sb3_flowpolicy.common.statistics import bootstrap_interquartile_mean
+from sb3_flowpolicy.common.statistics import interquartile_mean
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import Agent
 from sb3_flowpolicy.experiments.figures import color, smoothed
@@ -44,7 +44,7 @@ def profile_plot(evidence: Evidence, setting: str) -> go.Figure | None:
 
 def _add(figure: go.Figure, agent: Agent, curves: pd.DataFrame) -> None:
     x, values = curves.index.to_numpy(), curves.to_numpy().T
-    shade, mean = color(agent), bootstrap_interquartile_mean(values)
+    shade, mean = color(agent), interquartile_mean(values)
     group: dict[str, Any] = {"name": agent.label, "legendgroup": agent.name, "mode": "lines"}
     silent = {**group, "hoverinfo": "skip", "showlegend": False}
     # One trace for all seeds, with gaps in between: a phone draws few traces quickly.

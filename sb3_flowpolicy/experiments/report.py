@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from sb3_flowpolicy.common.files import write_text
-from sb3_flowpolicy.common.statistics import RESAMPLES, RESAMPLES_OF_PAIRS
+from sb3_flowpolicy.common.statistics import RESAMPLES
 from sb3_flowpolicy.experiments import evidence as definitions
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import (
@@ -53,8 +53,7 @@ makes an interactive page from them.
 
 METHOD = (
     "Every seed is drawn and counted; none is dropped. Numbers are interquartile means over seeds "
-    "with 95 % stratified bootstrap intervals in brackets (rliable, "
-    f"{RESAMPLES} resamples, {RESAMPLES_OF_PAIRS} for probabilities of improvement). "
+    f"with 95 % bootstrap intervals in brackets (percentiles of {RESAMPLES} resamples). "
     f"Test episodes are deterministic, at least ten per seed and measurement; on a tunnel, whose "
     "start is fixed, they are all the same episode. Training numbers average the episodes that "
     "ended since the last measurement, entropies 256 states of the replay buffer. "
