@@ -22,8 +22,8 @@ GROUPS = {
     "contrib": "updates:contrib",
     "learn": "learning:benchmarks",
     "her": "learning:with_hindsight",
+    "acting": "acting:benchmarks",
     "environments": "environments:benchmarks",
-    "trust": "trust:benchmarks",
     "flow": "flows:benchmarks",
 }
 # Increase it when a field of the JSON file changes its meaning.
@@ -39,8 +39,8 @@ Measure the speed of sb3_flowpolicy and of its baselines on this machine.
   learn         environment steps per second of learn(): SACFlow on TunnelDiagonal-v0 and PPOFlow
                 on Pendulum-v1 against SB3's
   her           the same with hindsight experience replay and dictionary observations
+  acting        calls of predict() per second: SAC and PPO, for one observation and for 100
   environments  steps per second of the environments, single and in batches of 64
-  trust         calls of predict per second in each deterministic_mode, 64 actions to choose from
   flow          RealNVP forward and backward against zuko's
 
 Candidates run in turns (A B C, A B C, ...), so that other load on the machine slows all of them

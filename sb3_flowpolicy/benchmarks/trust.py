@@ -1,8 +1,7 @@
-"""Cost of each way to choose a deterministic action, and of the training guard.
+"""``python -m sb3_flowpolicy.benchmarks.trust``: cost of the training guard.
 
-``benchmarks.throughput`` runs the first. The guard costs less than the noise between whole calls of
-``learn()``, so ``python -m sb3_flowpolicy.benchmarks.trust`` times each call of the guard during
-training and prints its share of a step.
+The guard costs less than the noise between whole calls of ``learn()``, so each call of the guard
+during training is timed on its own.
 """
 
 from __future__ import annotations
@@ -14,22 +13,17 @@ from functools import partial
 from typing import Any
 from unittest import mock
 
-import numpy as np
 import torch as th
 
 from sb3_flowpolicy.algorithms import engine_flow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.learning import ENV_ID, N_SEEDS, zoo_block
-from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
-from sb3_flowpolicy.benchmarks.updates import Unmoved
 from sb3_flowpolicy.guard.training_guard import UPDATES_BETWEEN_LOOKS, TrainingGuard
-from sb3_flowpolicy.policies.deterministic import MODES
 from sb3_flowpolicy.seeds import experience
 from sb3_flowpolicy.seeds.batch import SeedBatch
 
 # Steps whose calls are timed.
 CHUNK = 1000
-OBS_DIM, ACTION_DIM = 42, 8
 # All that the guard does during training.
 _CALLS = (
     (engine_flow, "check_step"),
@@ -38,32 +32,6 @@ _CALLS = (
     (TrainingGuard, "after_updates"),
     (TrainingGuard, "look"),
 )
-
-
-def benchmarks(quick: bool = False) -> list[Benchmark]:
-    """Return ``predict`` in each mode for one observation and for many."""
-    title = f"predict, nets 256-256, obs {OBS_DIM}, D = {ACTION_DIM}"
-    sizes = {
-        size: [Candidate(mode, partial(_acting, mode, size)) for mode in MODES] for size in (1, 100)
-    }
-    return [Benchmark(f"{title}, {n} at once", "calls", each) for n, each in sizes.items()]
-
-
-def _acting(mode: str, size: int) -> Work:
-    model = SACFlow(
-        "FlowPolicy",
-        Unmoved(OBS_DIM, ACTION_DIM),
-        buffer_size=1,
-        device="cpu",
-        policy_kwargs={"net_arch": [256, 256], "deterministic_mode": mode},
-    )
-    obs = np.random.default_rng(0).uniform(-1, 1, (size, OBS_DIM)).astype(np.float32)
-
-    def act() -> float:
-        model.predict(obs, deterministic=True)
-        return 1.0
-
-    return act
 
 
 def trained(algorithm: Any, chunk: int = CHUNK, **kwargs: Any) -> Any:

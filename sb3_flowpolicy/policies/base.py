@@ -62,6 +62,12 @@ class DensityPolicy(BasePolicy):
         check_finite(actions)
         return actions, state
 
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch batch normalization and dropout; ``predict`` does so at every step."""
+        # Walking through all modules each time would take longer than a small network does.
+        if self.training != mode or any(part.training != mode for part in self.children()):
+            super().set_training_mode(mode)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),

@@ -103,12 +103,6 @@ class DistributionPolicy(DensityPolicy):
         mode, n_candidates = self.deterministic_mode, self.deterministic_samples
         return best_actions(self.actor, self.critic, observation, mode, n_candidates)
 
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch batch normalization and dropout; ``predict`` does so at every step."""
-        # Walking through all modules each time would take longer than a small network does.
-        if not self.training == self.actor.training == self.critic.training == mode:
-            super().set_training_mode(mode)
-
     def up_to_date(self, policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """Return ``policy_kwargs`` with the deterministic settings that were changed later."""
         before = {**DETERMINISTIC_DEFAULTS, **policy_kwargs}

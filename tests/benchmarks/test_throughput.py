@@ -22,7 +22,7 @@ def test_quick_run_writes_the_documented_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "quick.json"
-    groups = ["learn", "her", "environments", "trust", "flow"]
+    groups = ["learn", "her", "acting", "environments", "flow"]
     only = [word for group in groups for word in ("--only", group)]
     main(["--quick", "--json", str(path), *only])
     result = json.loads(path.read_text())
