@@ -29,7 +29,6 @@ from sb3_flowpolicy.experiments.figures import (
     SMOOTHED_OVER,
     curves_figure,
     outcomes_figure,
-    panels,
     profile_figure,
 )
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
@@ -46,7 +45,7 @@ _MARKDOWN_HEAD = """# Experiments
 Written by `python -m sb3_flowpolicy.experiments report --docs docs/results`; do not edit. The data
 are in [experiments/](experiments), and
 `python -m sb3_flowpolicy.experiments report --results docs/results/experiments --html report.html`
-makes an interactive page from them.
+makes one page from them.
 
 **How to read this.** {method}
 """
@@ -107,20 +106,6 @@ class Section:
         ours = self.experiment.source == "ours"
         verdict = _OURS_IN_WORDS.get(self.verdict, self.verdict) if ours else self.verdict
         return verdict + (f" ({self.reservation})" if self.reservation else "")
-
-    def plots(self) -> list[tuple[str, list[str]]]:
-        """Return the interactive plots as JSON, grouped by setting."""
-        from sb3_flowpolicy.experiments.plots import curves_plot, profile_plot
-
-        if not self.measured:
-            return []
-        groups, metrics = [], panels(self.evidence)
-        for setting in self.experiment.settings:
-            figures = [curves_plot(self.evidence, setting.name, metric) for metric in metrics]
-            profile = profile_plot(self.evidence, setting.name)
-            figures += [] if profile is None else [profile]
-            groups.append((setting.name, [_for_html(f.to_json()) for f in figures if f.data]))
-        return groups
 
     def pictures(self) -> dict[str, Figure]:
         """Return the still pictures by name."""
@@ -183,7 +168,6 @@ def write_report(results: Path, page: Path) -> Path:
         ValueError: If there are no results, or a file is corrupt.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from plotly.offline import get_plotlyjs
 
     loader = PackageLoader("sb3_flowpolicy.experiments", package_path="")
     templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
@@ -194,8 +178,6 @@ def write_report(results: Path, page: Path) -> Path:
         not_measured=NOT_MEASURED,
         pictures={s.experiment.name: _inline(s.pictures()) for s in sections},
         date=datetime.now(timezone.utc).date().isoformat(),
-        # In contrast to our data, it contains nothing that closes a script element.
-        plotly=get_plotlyjs(),
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     write_text(page, text)
@@ -203,11 +185,10 @@ def write_report(results: Path, page: Path) -> Path:
 
 
 def _inline(figures: dict[str, Figure]) -> dict[str, str]:
-    """Return figures as data URLs, except those that the page shows interactively."""
+    """Return figures as data URLs."""
     return {
         name: "data:image/png;base64," + base64.b64encode(png(figure, dpi=90)).decode()
         for name, figure in figures.items()
-        if name in ("outcomes", "policies")
     }
 
 
@@ -269,8 +250,3 @@ def png(figure: Any, dpi: int) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=dpi, format="png", metadata={"Software": None})
     return buffer.getvalue()
-
-
-def _for_html(text: str) -> str:
-    """Keep JSON from closing the element that it stands in."""
-    return text.replace("</", "<\\/")
