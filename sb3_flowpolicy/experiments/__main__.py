@@ -7,7 +7,6 @@ import contextlib
 import os
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least
@@ -58,20 +57,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _list(args: argparse.Namespace) -> None:
-    print(
-        f"{'experiment':<22}{'claim':<7}{'agents':>6}{'settings':>9}{'steps':>11}{'seeds':>6}",
-        end="",
-    )
-    print(f"{'time':>10}  here?  what it compares")
-    for experiment in EXPERIMENTS.values():
-        missing = what_is_missing(experiment)
-        plan = make_plan(experiment, args.profile)
-        print(
-            f"{experiment.name:<22}{experiment.claim:<7}{len(experiment.agents):>6}"
-            f"{len(experiment.settings):>9}{plan.steps:>11,}{len(plan.seeds):>6}"
-            f"{in_words(plan_seconds(plan, args.workers)):>10}  {'no' if missing else 'yes':<5}  "
-            f"{experiment.title}" + (f" [needs {missing}]" if missing else "")
-        )
+    line = "{:<22}{:<7}{:>6}{:>9}{:>11}{:>6}{:>10}  {}"
+    head = ("experiment", "claim", "agents", "settings", "steps", "seeds", "time")
+    print(line.format(*head, "what it compares"))
+    for one in EXPERIMENTS.values():
+        missing, plan = what_is_missing(one), make_plan(one, args.profile)
+        sizes = len(one.agents), len(one.settings), f"{plan.steps:,}", len(plan.seeds)
+        time = in_words(plan_seconds(plan, args.workers))
+        needs = f" [needs {missing}]" if missing else ""
+        print(line.format(one.name, one.claim, *sizes, time, one.title + needs))
     print(
         f"\nTimes are estimates for {args.workers} cores like those of docs/results/experiments.md,"
         " from measured speeds."
@@ -129,19 +123,17 @@ def _parser() -> argparse.ArgumentParser:
         "trains the agents, `report` draws and judges the results.",
     )
     commands = parser.add_subparsers(required=True, metavar="list|run|report")
-
-    def add_command(name: str, function: Callable, text: str) -> argparse.ArgumentParser:
-        description = text[0].upper() + text[1:] + "."
-        command = commands.add_parser(
-            name, help=text, description=description, formatter_class=HelpFormatter
+    show, run, report = (
+        commands.add_parser(name, help=text, description=text, formatter_class=HelpFormatter)
+        for name, text in (
+            ("list", "Show all experiments, their cost and whether they can run here."),
+            ("run", "Run one experiment, or continue it after an interruption."),
+            ("report", "Write one HTML page from all results, and the tables for the docs."),
         )
-        command.set_defaults(command=function)
-        return command
-
-    show = add_command(
-        "list", _list, "show all experiments, their cost and whether they can run here"
     )
-    run = add_command("run", _run, "run one experiment, or continue it after an interruption")
+    show.set_defaults(command=_list)
+    run.set_defaults(command=_run)
+    report.set_defaults(command=_report)
     add, count = run.add_argument, at_least(1)
     add("name", metavar="NAME", help="experiment; `list` shows them")
     seeds = f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})"
@@ -162,14 +154,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-progress", action="store_true", help="show no progress bars")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     for command in (show, run):
-        add = command.add_argument
         quick = "quick: two seeds and few steps, to check that everything works"
-        add("--profile", choices=("full", "quick"), default="full", help=quick)
+        command.add_argument("--profile", choices=("full", "quick"), default="full", help=quick)
         workers = "processes at a time, one core each"
-        add("--workers", type=count, default=cores, help=workers)
-    report = add_command(
-        "report", _report, "write one HTML page from all results, and the tables for the docs"
-    )
+        command.add_argument("--workers", type=count, default=cores, help=workers)
     add = report.add_argument
     add("--results", type=Path, default=OUT["full"], help="folder that `run` wrote")
     add("--html", type=Path, help="page to write (default: report.html in it)")

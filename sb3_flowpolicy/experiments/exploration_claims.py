@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from sb3_flowpolicy.experiments.checks import at_least_times, ordered, solved
+from sb3_flowpolicy.experiments import checks
 from sb3_flowpolicy.experiments.dimensions.prediction import WIDTHS
 from sb3_flowpolicy.experiments.experiment import (
     FLOW,
@@ -37,16 +37,8 @@ SPLINE_PINK = Agent(
 )
 
 EXPLORERS = (
-    GAUSS,
-    GAUSS_PINK,
-    GSDE,
-    LATTICE,
-    LOW_RANK,
-    FULL_COVARIANCE,
-    FLOW,
-    FLOW_PINK,
-    SPLINE,
-    SPLINE_PINK,
+    *(GAUSS, GAUSS_PINK, GSDE, LATTICE, LOW_RANK, FULL_COVARIANCE),
+    *(FLOW, FLOW_PINK, SPLINE, SPLINE_PINK),
 )
 
 # No agent learns a tunnel that couples all of eight dimensions (diagonal-dimensions), so two are
@@ -80,7 +72,7 @@ EXPLORATION_CLAIMS = (
         ),
         agents=_WIDENED,
         checks=tuple(
-            solved(f"{dims}-dimensions", agent, 0.9) for dims in WIDTHS for agent in _WIDENED
+            checks.solved(f"{dims}-dimensions", agent, 0.9) for dims in WIDTHS for agent in _WIDENED
         ),
         notes="Everything but the width is as in diagonal-dimensions, where it is constant and no "
         "agent solves four or more dimensions. `python -m sb3_flowpolicy.experiments.dimensions` "
@@ -100,7 +92,7 @@ EXPLORATION_CLAIMS = (
             for name, env_kwargs in _TUNNELS.items()
         ),
         agents=EXPLORERS,
-        checks=tuple(solved(name, agent, 0.9) for name in _TUNNELS for agent in EXPLORERS),
+        checks=tuple(checks.solved(name, agent, 0.9) for name in _TUNNELS for agent in EXPLORERS),
         pictures_at=(1.0,),
         notes="Hyperparameters are those of sparse-fixed-alpha, for every agent. gSDE keeps its "
         "noise for 8 steps and then does 8 updates, as is usual; all others update at every step. "
@@ -118,8 +110,11 @@ EXPLORATION_CLAIMS = (
         settings=(Setting("move-x", "SquareMoveX-v0", overrides=_SMALLER),),
         agents=_ON_SQUARE,
         checks=(
-            *(at_least_times("move-x", "x_std", agent, GAUSS, 1.5) for agent in _ON_SQUARE[1:]),
-            *(ordered("move-x", "entropy", (agent, GAUSS)) for agent in _WITH_ENTROPY),
+            *(
+                checks.at_least_times("move-x", "x_std", agent, GAUSS, 1.5)
+                for agent in _ON_SQUARE[1:]
+            ),
+            *(checks.ordered("move-x", "entropy", (agent, GAUSS)) for agent in _WITH_ENTROPY),
         ),
         steps=30_000,
         measures=("x_std", "x_max"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_flowpolicy.experiments.checks import about_equal, at_least_times, ordered, reaches
+from sb3_flowpolicy.experiments import checks
 from sb3_flowpolicy.experiments.experiment import (
     AGENTS,
     FLOW,
@@ -33,7 +33,7 @@ def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:
         thesis="All three agents learn equally well and end near the tuned results of others, 2053 "
         "on Walker2D and 3485 on Ant.",
         settings=(Setting(setting, env_id),),
-        checks=tuple(reaches(setting, "test_return", agent, published) for agent in AGENTS),
+        checks=tuple(checks.reaches(setting, "test_return", agent, published) for agent in AGENTS),
         steps=1_000_000,
         seeds=3,
         eval_every=20_000,
@@ -54,9 +54,9 @@ FURTHER_CLAIMS = (
         settings=(Setting("hold", "SquareHold-v1"),),
         agents=_GAUSS_AND_FLOW,
         checks=(
-            ordered("hold", "entropy", (FLOW, GAUSS), 1.0),
-            ordered("hold", "train_return", (FLOW, GAUSS)),
-            about_equal("hold", "test_return", _GAUSS_AND_FLOW, 0.1),
+            checks.ordered("hold", "entropy", (FLOW, GAUSS), 1.0),
+            checks.ordered("hold", "train_return", (FLOW, GAUSS)),
+            checks.about_equal("hold", "test_return", _GAUSS_AND_FLOW, 0.1),
         ),
         steps=_SQUARE_STEPS,
         seeds=_SQUARE_SEEDS,
@@ -78,8 +78,8 @@ FURTHER_CLAIMS = (
         ),
         agents=_GAUSS_AND_FLOW,
         checks=(
-            ordered("target-2", "train_return", (FLOW, GAUSS)),
-            about_equal("target-8", "train_return", _GAUSS_AND_FLOW, 0.1),
+            checks.ordered("target-2", "train_return", (FLOW, GAUSS)),
+            checks.about_equal("target-8", "train_return", _GAUSS_AND_FLOW, 0.1),
         ),
         steps=_SQUARE_STEPS,
         seeds=_SQUARE_SEEDS,
@@ -92,7 +92,7 @@ FURTHER_CLAIMS = (
         title="Hold the square and move: correlation of the actions",
         thesis="NF's actions of the same axis are clearly correlated, LR's less, Gauss's not.",
         settings=(Setting("move", "SquareMove-v1"),),
-        checks=(ordered("move", "same_axis_correlation", (FLOW, LOW_RANK, GAUSS)),),
+        checks=(checks.ordered("move", "same_axis_correlation", (FLOW, LOW_RANK, GAUSS)),),
         steps=_SQUARE_STEPS,
         seeds=_SQUARE_SEEDS,
         eval_every=4000,
@@ -107,9 +107,9 @@ FURTHER_CLAIMS = (
         "distance about twice, LR lies between.",
         settings=(Setting("move-x", "SquareMoveX-v1"),),
         checks=(
-            at_least_times("move-x", "x_std", FLOW, GAUSS, 2.0),
-            at_least_times("move-x", "x_max", FLOW, GAUSS, 1.5),
-            ordered("move-x", "x_std", (FLOW, LOW_RANK, GAUSS)),
+            checks.at_least_times("move-x", "x_std", FLOW, GAUSS, 2.0),
+            checks.at_least_times("move-x", "x_max", FLOW, GAUSS, 1.5),
+            checks.ordered("move-x", "x_std", (FLOW, LOW_RANK, GAUSS)),
         ),
         steps=_SQUARE_STEPS,
         seeds=3,
@@ -128,7 +128,7 @@ FURTHER_CLAIMS = (
         "that, NF rises above it.",
         settings=(Setting("find-goal", "SquareFindGoal-v1"),),
         agents=_GAUSS_AND_FLOW,
-        checks=(ordered("find-goal", "train_success", (FLOW, GAUSS), 0.05),),
+        checks=(checks.ordered("find-goal", "train_success", (FLOW, GAUSS), 0.05),),
         steps=_SQUARE_STEPS,
         seeds=_SQUARE_SEEDS,
         eval_every=4000,

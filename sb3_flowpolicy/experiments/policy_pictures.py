@@ -45,7 +45,11 @@ def policies_figure(evidence: Evidence) -> Figure | None:
             axes.spines[:].set_color("#dddddd")
         for axes in line[1 + len(picture["steps"]) :]:
             axes.set_axis_off()
-        _draw_world(line[0], env, picture)
+        _draw_tunnel(line[0], env)
+        trail = np.array(picture["trail"])
+        line[0].plot(*trail.T, color="black", linewidth=0.6, marker=".", markersize=3)
+        line[0].set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
+        line[0].set_title("the episode", fontsize=7)
         for k, axes in zip(range(len(picture["steps"])), line[1:], strict=False):
             _draw_policy(axes, env, picture, k)
         where = f"{setting.name}, " if several else ""
@@ -70,35 +74,18 @@ def _draw_tunnel(axes: Axes, env: Any) -> None:
         axes.plot(*(centre + side * across).T, color=_WALL, linewidth=0.7)
 
 
-def _draw_world(axes: Axes, env: Any, picture: dict[str, Any]) -> None:
-    _draw_tunnel(axes, env)
-    trail = np.array(picture["trail"])
-    axes.plot(*trail.T, color="black", linewidth=0.6, marker=".", markersize=3)
-    axes.set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
-    axes.set_title("the episode", fontsize=7)
-
-
 def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:
-    position = np.array(picture["positions"][k])
-    trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
-    reach = env.config.reach
-    _draw_tunnel(axes, env)
-    ends = position + reach * np.array(picture["samples"][k])
-    axes.scatter(trail[:, 0], trail[:, 1], s=4, color="#969696", linewidths=0)
-    axes.add_patch(_box(position, reach))
-    axes.scatter(ends[:, 0], ends[:, 1], s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
-    axes.scatter(position[0], position[1], s=10, color="black", zorder=3)
-    view = _VIEW * reach
-    axes.set(
-        xlim=(position[0] - view, position[0] + view),
-        ylim=(position[1] - view, position[1] + view),
-        aspect="equal",
-    )
-    axes.set_title(f"step {picture['steps'][k]}", fontsize=7)
-
-
-def _box(position: np.ndarray, reach: float) -> Any:
     from matplotlib.patches import Rectangle
 
-    corner = (float(position[0] - reach), float(position[1] - reach))
-    return Rectangle(corner, 2 * reach, 2 * reach, fill=False, edgecolor="#aaaaaa", linewidth=0.7)
+    x, y = picture["positions"][k]
+    trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
+    reach, view = env.config.reach, _VIEW * env.config.reach
+    ends = (x, y) + reach * np.array(picture["samples"][k])
+    box = {"fill": False, "edgecolor": "#aaaaaa", "linewidth": 0.7}
+    _draw_tunnel(axes, env)
+    axes.scatter(*trail.T, s=4, color="#969696", linewidths=0)
+    axes.add_patch(Rectangle((x - reach, y - reach), 2 * reach, 2 * reach, **box))
+    axes.scatter(*ends.T, s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
+    axes.scatter(x, y, s=10, color="black", zorder=3)
+    axes.set(xlim=(x - view, x + view), ylim=(y - view, y + view), aspect="equal")
+    axes.set_title(f"step {picture['steps'][k]}", fontsize=7)

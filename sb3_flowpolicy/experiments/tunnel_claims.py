@@ -2,19 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_flowpolicy.experiments.checks import (
-    about_equal,
-    at_least_times,
-    front_loads,
-    is_steady,
-    mostly_fails,
-    no_better_than,
-    none_fails,
-    ordered,
-    oscillates,
-    slower,
-    solved,
-)
+from sb3_flowpolicy.experiments import checks
 from sb3_flowpolicy.experiments.experiment import (
     AGENTS,
     FLOW,
@@ -32,7 +20,7 @@ _SPARSE = (
     Setting("horizontal", "TunnelHorizontal-v0"),
     Setting("diagonal", "TunnelDiagonal-v0"),
 )
-_HORIZONTAL_ALIKE = tuple(solved("horizontal", agent, 0.9, at_best=True) for agent in AGENTS)
+_HORIZONTAL_ALIKE = tuple(checks.solved("horizontal", agent, 0.9, at_best=True) for agent in AGENTS)
 
 TUNNEL_CLAIMS = (
     Experiment(
@@ -45,10 +33,10 @@ TUNNEL_CLAIMS = (
         settings=(Setting("circle", "TunnelCircle-v1"),),
         agents=(*AGENTS, FLOW_DEFAULT_INIT),
         checks=(
-            about_equal("circle", "test_return", AGENTS, 0.1),
-            ordered("circle", "entropy", (FLOW, LOW_RANK, GAUSS)),
-            slower("circle", GAUSS, (LOW_RANK, FLOW)),
-            none_fails("circle", FLOW),
+            checks.about_equal("circle", "test_return", AGENTS, 0.1),
+            checks.ordered("circle", "entropy", (FLOW, LOW_RANK, GAUSS)),
+            checks.slower("circle", GAUSS, (LOW_RANK, FLOW)),
+            checks.none_fails("circle", FLOW),
         ),
         measures=("profile",),
         pictures_at=(0.1, 0.25, 1.0),
@@ -68,10 +56,10 @@ TUNNEL_CLAIMS = (
         "equal. Gauss meets the entropy target on the first steps, where it costs least.",
         settings=(Setting("circle", "TunnelCircle-v1", overrides=LEARNED),),
         checks=(
-            at_least_times("circle", "train_return", FLOW, GAUSS, 1.5),
-            about_equal("circle", "test_return", (FLOW, GAUSS), 0.1),
-            front_loads("circle", GAUSS, FLOW, 0.5),
-            none_fails("circle", FLOW),
+            checks.at_least_times("circle", "train_return", FLOW, GAUSS, 1.5),
+            checks.about_equal("circle", "test_return", (FLOW, GAUSS), 0.1),
+            checks.front_loads("circle", GAUSS, FLOW, 0.5),
+            checks.none_fails("circle", FLOW),
         ),
         measures=("profile",),
         pictures_at=(1.0,),
@@ -92,9 +80,9 @@ TUNNEL_CLAIMS = (
         "up and down together, in every seed; those of NF and LR do not.",
         settings=(Setting("narrow", "TunnelCircleNarrow-v1"),),
         checks=(
-            oscillates("narrow", GAUSS, 1.0),
-            is_steady("narrow", LOW_RANK, 0.0),
-            is_steady("narrow", FLOW, 0.0),
+            checks.oscillates("narrow", GAUSS, 1.0),
+            checks.is_steady("narrow", LOW_RANK, 0.0),
+            checks.is_steady("narrow", FLOW, 0.0),
         ),
         steps=120_000,
         eval_every=500,
@@ -119,11 +107,11 @@ TUNNEL_CLAIMS = (
         settings=_SPARSE,
         checks=(
             *_HORIZONTAL_ALIKE,
-            about_equal("horizontal", "train_return", AGENTS, 0.1),
-            mostly_fails("diagonal", GAUSS, 0.3),
-            solved("diagonal", LOW_RANK, 0.9),
-            solved("diagonal", FLOW, 0.9),
-            ordered("diagonal", "train_return", (FLOW, LOW_RANK)),
+            checks.about_equal("horizontal", "train_return", AGENTS, 0.1),
+            checks.mostly_fails("diagonal", GAUSS, 0.3),
+            checks.solved("diagonal", LOW_RANK, 0.9),
+            checks.solved("diagonal", FLOW, 0.9),
+            checks.ordered("diagonal", "train_return", (FLOW, LOW_RANK)),
         ),
         pictures_at=(1.0,),
         notes="Networks of two layers with 16 units (NF: 4), as in the thesis. Not reproduced: "
@@ -144,11 +132,11 @@ TUNNEL_CLAIMS = (
         settings=tuple(Setting(s.name, s.env_id, overrides=LEARNED) for s in _SPARSE),
         checks=(
             *_HORIZONTAL_ALIKE,
-            about_equal("horizontal", "train_return", AGENTS, 0.1),
-            mostly_fails("diagonal", GAUSS, 0.3),
-            ordered("diagonal", "train_success", (FLOW, GAUSS), 0.2),
-            ordered("diagonal", "train_success", (LOW_RANK, GAUSS), 0.2),
-            no_better_than("sparse-fixed-alpha", "diagonal", (LOW_RANK, FLOW)),
+            checks.about_equal("horizontal", "train_return", AGENTS, 0.1),
+            checks.mostly_fails("diagonal", GAUSS, 0.3),
+            checks.ordered("diagonal", "train_success", (FLOW, GAUSS), 0.2),
+            checks.ordered("diagonal", "train_success", (LOW_RANK, GAUSS), 0.2),
+            checks.no_better_than("sparse-fixed-alpha", "diagonal", (LOW_RANK, FLOW)),
         ),
         pictures_at=(1.0,),
         notes="An entropy of -2 nats is too high for a tunnel of this width: every agent fails "
@@ -174,7 +162,7 @@ TUNNEL_CLAIMS = (
             for count in DIMENSIONS
         ),
         checks=tuple(
-            solved(f"{count}-dimensions", agent, 0.9)
+            checks.solved(f"{count}-dimensions", agent, 0.9)
             for count in DIMENSIONS
             for agent in (LOW_RANK, FLOW)
         ),

@@ -89,8 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, TypeError) as error:
         parser.error(str(error))
     with tqdm(total=args.budget * len({"independent", *args.families}), unit=" policies") as bar:
-        found = predict(setting, args.families, bar.update)
-    families = {name: vars(prediction) for name, prediction in found.items()}
+        families = predict(setting, args.families, bar.update)
     table = pd.DataFrame.from_dict(families, orient="index")
     others, base = table.drop("independent"), table.loc["independent"]
     differences = others[["value", "entropy"]] - base[["value", "entropy"]]

@@ -56,38 +56,6 @@ class Setting:
     seed: int = 0
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """What a policy is worth, per step after the warm-up.
-
-    Attributes:
-        press_x, press_y: Median action that presses, along x and along y.
-        value: SAC's objective.
-        entropy: Entropy of the squashed actions, nats.
-        hazard: Probability per step that the episode fails; a finger that breaks during the
-            warm-up counts, too.
-        broken: Share of the failures in which a finger broke.
-        reward: Mean reward without the penalty of a failure.
-        kept: Reward as a share of the reward for holding.
-        x_std, x_max, distance_max: The environment's metrics, averaged over episodes in proportion
-            to their steps after the warm-up.
-        found: Share of the episodes in which the goal was found.
-    """
-
-    press_x: float
-    press_y: float
-    value: float
-    entropy: float
-    hazard: float
-    broken: float
-    reward: float
-    kept: float
-    x_std: float
-    x_max: float
-    distance_max: float
-    found: float
-
-
 def setting_of(
     env_id: str,
     task: dict[str, float] | None = None,
@@ -117,8 +85,8 @@ def predict(
     setting: Setting,
     names: tuple[str, ...] = tuple(FAMILIES),
     report: Callable[[int], None] | None = None,
-) -> dict[str, Prediction]:
-    """Search the best policy of each family, named as in `FAMILIES`.
+) -> dict[str, dict[str, float]]:
+    """Search the best policy of each family, named as in `FAMILIES`, and :func:`measure` it.
 
     A policy presses with a constant mean, plus noise, squashed by tanh. Independent noise is always
     searched, because the other families begin where it ended. ``report`` is called with the number
@@ -137,7 +105,9 @@ def predict(
             while not search.stop():
                 points = search.ask()
                 draws = search.countiter % _DRAWS
-                values = [_evaluate(setting, name, point, batch, draws).value for point in points]
+                values = [
+                    _evaluate(setting, name, point, batch, draws)["value"] for point in points
+                ]
                 search.tell(points, [-value for value in values])
                 if report is not None:
                     report(len(points))
@@ -150,7 +120,7 @@ def predict(
 
 def _evaluate(
     setting: Setting, name: str, parameters: Array, batch: SquareBatch, draws: int
-) -> Prediction:
+) -> dict[str, float]:
     """Simulate a policy with the random numbers `draws`."""
     family = FAMILIES[name]
     means = np.clip(_PRESS_START + _PRESS_STEP * parameters[:2], 0.0, 3.0) @ INWARDS
@@ -161,7 +131,7 @@ def _evaluate(
 
 def measure(
     setting: Setting, means: Array, root: Array, noise: Array, batch: SquareBatch, seed: int
-) -> Prediction:
+) -> dict[str, float]:
     """Simulate one episode in each world of `batch`.
 
     Args:
@@ -171,6 +141,10 @@ def measure(
         noise: Added to the means, (T, N, 8), for T steps in N worlds.
         batch: N worlds with the rules of the setting.
         seed: Seed of the starts.
+
+    Returns:
+        What the policy is worth, per step after the warm-up: the columns that the command's help
+        explains. A finger that breaks during the warm-up counts as a failure, too.
     """
     generator = np.random.default_rng(seed)
     batch.reset(batch.everyone, lambda _: generator)
@@ -188,18 +162,18 @@ def measure(
     gain = reward + setting.ent_coef * entropy - task.failure * hazard
     metrics = dict(zip(METRICS, (lengths @ batch.metrics / steps).tolist(), strict=True))
     presses = np.tanh(INWARDS @ means / 2.0)
-    return Prediction(
-        press_x=float(presses[0]),
-        press_y=float(presses[1]),
-        value=float(gain / (1.0 - setting.gamma * (1.0 - hazard))),
-        entropy=entropy,
-        hazard=hazard,
-        broken=int((batch.ends == kernels.BROKEN).sum()) / max(failures, 1),
-        reward=float(reward),
-        kept=float(reward / task.held) if task.held else 0.0,
+    return {
+        "press_x": float(presses[0]),
+        "press_y": float(presses[1]),
+        "value": float(gain / (1.0 - setting.gamma * (1.0 - hazard))),
+        "entropy": entropy,
+        "hazard": hazard,
+        "broken": int((batch.ends == kernels.BROKEN).sum()) / max(failures, 1),
+        "reward": float(reward),
+        "kept": float(reward / task.held) if task.held else 0.0,
         **{name: metrics[name] for name in ("x_std", "x_max", "distance_max")},
-        found=float(batch.found.mean()),
-    )
+        "found": float(batch.found.mean()),
+    }
 
 
 @functools.lru_cache(maxsize=2 * _DRAWS)

@@ -29,7 +29,7 @@ def test_entropy_is_that_of_squashed_noise():
     batch, mean, scale = SquareBatch(setting.config, 400), 0.8, 0.4
     noise = scale * np.random.default_rng(0).standard_normal((20, 400, 8))
     means = mean * INWARDS.sum(axis=0)
-    found = measure(setting, means, scale * np.eye(8), noise, batch, 0).entropy
+    found = measure(setting, means, scale * np.eye(8), noise, batch, 0)["entropy"]
 
     a = np.linspace(-1, 1, 400_001)[1:-1]
     expected = 0.0
@@ -46,18 +46,18 @@ def test_the_objective_of_a_safe_policy_is_its_reward_over_one_minus_gamma():
     batch = SquareBatch(setting.config, 8)
     noise = np.zeros((setting.steps, 8, 8))
     found = measure(setting, 0.8 * INWARDS.sum(axis=0), 1e-3 * np.eye(8), noise, batch, 0)
-    assert found.hazard == 0.0
-    assert found.value == pytest.approx(1.0 / (1.0 - 0.9))
-    assert found.kept == 1.0
+    assert found["hazard"] == 0.0
+    assert found["value"] == pytest.approx(1.0 / (1.0 - 0.9))
+    assert found["kept"] == 1.0
 
 
 def test_coordination_pays_where_opposed_fingers_lose_their_grip():
     setting = setting_of("SquareMoveX-v1", budget=150, episodes=16)
     found = predict(setting, ("independent", "full"))
     independent, full = found["independent"], found["full"]
-    assert full.entropy > independent.entropy + 0.5
-    assert full.x_std > 1.3 * independent.x_std
-    assert min(independent.kept, full.kept) > 0.6
+    assert full["entropy"] > independent["entropy"] + 0.5
+    assert full["x_std"] > 1.3 * independent["x_std"]
+    assert min(independent["kept"], full["kept"]) > 0.6
 
 
 def test_command_writes_what_it_prints(tmp_path, capsys):
