@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least
-from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find, what_is_missing
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
 from sb3_flowpolicy.experiments.runner import Progress, results_folder, run_local, unfinished
 from sb3_flowpolicy.experiments.work import (
     FIRST_SEED,
@@ -73,7 +73,7 @@ def _list(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    experiment = vary(find(args.name), dict(args.set), args.agents)
+    experiment = vary(EXPERIMENTS[args.name], dict(args.set), args.agents)
     missing = what_is_missing(experiment)
     if missing:
         raise ValueError(f"{experiment.name} needs {missing}, which is not installed")
@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
     report.set_defaults(command=_report)
     add, count = run.add_argument, at_least(1)
-    add("name", metavar="NAME", help="experiment; `list` shows them")
+    add("name", metavar="NAME", choices=EXPERIMENTS, help="experiment; `list` shows them")
     seeds = f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})"
     add("--seeds", type=count, help=seeds)
     first = "1 for results, 100 for tuning"

@@ -48,7 +48,7 @@ class Evidence:
     Args:
         experiment: The experiment.
         folder: Its folder, complete or not.
-        others: Returns the evidence of another experiment by name, None if there is none.
+        others: From the name of another experiment to its evidence, if there is any.
 
     Raises:
         ValueError: If a file is corrupt, or was changed since its item was finished.
@@ -222,10 +222,6 @@ def swings(values: np.ndarray, amplitude: float) -> int:
     """Count how often a curve turns round after moving at least ``amplitude`` one way.
 
     Small wiggles do not count. A monotonic curve has none, a square wave over three periods five.
-
-    Args:
-        values: The curve, (T,).
-        amplitude: Least difference between a high and the low that follows, above 0.
 
     Example:
         >>> swings(np.array([0.0, 1.0, 0.1, 0.2, 0.9, 0.0]), 0.5)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.exploration_claims import EXPLORATION_CLAIMS
@@ -21,23 +19,6 @@ EXPERIMENTS: dict[str, Experiment] = {
     )
 }
 """Name to experiment, in the order of the claims."""
-
-
-def find(name: str) -> Experiment:
-    """Return the experiment of that name.
-
-    Raises:
-        ValueError: If there is none; the message lists the names.
-
-    Example:
-        >>> find("sparse-fixed-alpha").claim
-        'E5'
-    """
-    if name not in EXPERIMENTS:
-        close = difflib.get_close_matches(name, EXPERIMENTS, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"name must be one of {', '.join(EXPERIMENTS)}, got {name!r}{hint}")
-    return EXPERIMENTS[name]
 
 
 def what_is_missing(experiment: Experiment) -> str | None:

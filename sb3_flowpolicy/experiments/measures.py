@@ -71,13 +71,7 @@ TRAINING_INFOS = ("x_std", "x_max")
 
 
 class DeterministicEpisodes:
-    """Deterministic episodes of several policies, all stepped at once.
-
-    Args:
-        env: Environment.
-        n_models: Number of policies.
-        n_episodes: Number of episodes of each.
-    """
+    """Deterministic episodes of several policies, all stepped at once."""
 
     def __init__(self, env: str, n_models: int, n_episodes: int) -> None:
         self.n_models, self.n_episodes = n_models, n_episodes

@@ -137,10 +137,7 @@ def reservation(experiment: Experiment, settings: Mapping[str, Any]) -> str | No
 
 
 def read_results(results: Path) -> list[Evidence]:
-    """Read the results of all experiments.
-
-    Args:
-        results: Folder that ``run`` wrote.
+    """Read the results of all experiments in a folder that ``run`` wrote.
 
     Raises:
         ValueError: If the folder holds no results, or a file is corrupt.

@@ -55,10 +55,7 @@ def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
 class Progress:
     """A bar over the environment steps of all seeds that names the items at work.
 
-    Args:
-        items: All items.
-        finished: Keys of those that were finished before this run.
-        shown: Whether to draw the bar.
+    ``finished`` holds the keys of the items that were finished before this run.
     """
 
     def __init__(

@@ -43,15 +43,10 @@ current stage began."""
 
 
 def run_item(item: WorkItem, folder: Path, report: Report) -> None:
-    """Train an item to its end, from its last checkpoint if there is one.
+    """Train an item to its end, from its last checkpoint in the folder if there is one.
 
     The results are the same whether or not the run was interrupted, except for environments that
     cannot be pickled: they begin new episodes.
-
-    Args:
-        item: The item.
-        folder: Folder of its files.
-        report: Called with the progress.
 
     Raises:
         ValueError: If another process is at work on the item, or its files are damaged.

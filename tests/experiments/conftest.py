@@ -11,7 +11,7 @@ import pytest
 
 from sb3_flowpolicy.experiments.checks import mostly_fails, none_fails
 from sb3_flowpolicy.experiments.experiment import FLOW, GAUSS, Experiment, Setting
-from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
 from sb3_flowpolicy.experiments.work import Plan, make_plan
 
@@ -56,7 +56,7 @@ def make_up(tmp_path: Path) -> MakeUp:
 
     def write(name: str, levels: dict[str, float] | None = None, seeds: int = 10) -> Plan:
         chosen = levels or {"gauss": 0.0}
-        plan = make_plan(find(name), seeds=seeds)
+        plan = make_plan(EXPERIMENTS[name], seeds=seeds)
         folder = tmp_path / name
         claim_folder(folder, plan.settings())
         for item in plan.items:

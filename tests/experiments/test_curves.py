@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 
 from sb3_flowpolicy.experiments.evidence import Evidence, swings
-from sb3_flowpolicy.experiments.manifest import find
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 
 
 def test_logs_of_unequal_length_meet_on_a_grid(tmp_path: Path) -> None:
-    evidence = Evidence(find("circle-narrow"), tmp_path)
+    evidence = Evidence(EXPERIMENTS["circle-narrow"], tmp_path)
     log = {
         "seed": [1, 1, 1, 1, 2, 2],
         "step": [10.0, 20.0, 30.0, 40.0, 15.0, 25.0],

@@ -14,7 +14,7 @@ import pytest
 from sb3_flowpolicy.experiments.__main__ import main
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import GAUSS, NOT_MEASURED, Experiment
-from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, find
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.report import reservation
 from sb3_flowpolicy.experiments.store import ItemFiles, read_settings
 from sb3_flowpolicy.experiments.work import make_plan
@@ -62,7 +62,7 @@ def test_rows_that_are_missing_or_odd_are_noticed(
     files = ItemFiles(tmp_path / NAME, "narrow-flow")
     files.table.write_text("".join(change(files.table.read_text().splitlines(keepends=True))))
     with pytest.raises(ValueError, match=r"narrow-flow\.csv .*must hold"):
-        Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
+        Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
 
 
 def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -
     table = tmp_path / NAME / "narrow-flow.csv"
     table.write_text(table.read_text().replace("500,50,", "500,51,", 1))
     with pytest.raises(ValueError, match="or other contents"):
-        Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
+        Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_facts_of_something_else_are_noticed(
     done = tmp_path / NAME / "narrow-flow.done.json"
     done.write_text(json.dumps({**json.loads(done.read_text()), **facts}))
     with pytest.raises(ValueError, match=rf"narrow-flow\.done\.json {message}"):
-        Evidence(find(NAME), tmp_path / NAME).final("narrow", "flow", "entropy")
+        Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
 
 
 def test_a_run_does_not_build_on_damage(
@@ -127,7 +127,7 @@ def test_a_missing_field_is_named(
     del content[drop]
     path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message):
-        Evidence(find(NAME), tmp_path / NAME)
+        Evidence(EXPERIMENTS[NAME], tmp_path / NAME)
     assert main(["report", "--results", str(tmp_path)]) == 1
     assert capsys.readouterr().err.startswith("error: ")
 
@@ -150,7 +150,7 @@ def test_settings_of_another_kind_are_refused(
 
 
 def test_results_that_are_not_the_experiments_own_are_marked() -> None:
-    experiment = find(NAME)
+    experiment = EXPERIMENTS[NAME]
 
     def said(**changes: Any) -> str | None:
         plan = make_plan(experiment, **changes)
@@ -172,7 +172,9 @@ def test_an_agent_that_was_added_later_leaves_the_claim_open(
     make_up: MakeUp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_up(NAME, seeds=2)
-    grown = replace(find(NAME), agents=(*find(NAME).agents, replace(GAUSS, name="late")))
+    grown = replace(
+        EXPERIMENTS[NAME], agents=(*EXPERIMENTS[NAME].agents, replace(GAUSS, name="late"))
+    )
     monkeypatch.setitem(EXPERIMENTS, NAME, grown)
     evidence = Evidence(grown, tmp_path / NAME)
     assert evidence.judge()[0] == NOT_MEASURED
@@ -184,7 +186,7 @@ def test_what_was_not_measured_leaves_the_claim_open(make_up: MakeUp, tmp_path: 
     for path in (tmp_path / "circle-fixed-entropy").glob("*.details.jsonl"):
         path.unlink()
         declare_whole(ItemFiles(path.parent, path.name.removesuffix(".details.jsonl")))
-    experiment = find("circle-fixed-entropy")
+    experiment = EXPERIMENTS["circle-fixed-entropy"]
     verdict, findings = Evidence(experiment, tmp_path / experiment.name).judge()
     assert verdict == NOT_MEASURED
     assert findings[2].measured == "profile of gauss on circle was not measured"
@@ -201,7 +203,7 @@ def test_three_times_the_bar_reaches_the_bar(make_up: MakeUp, tmp_path: Path) ->
         lines[k] = ",".join(cells)
     files.table.write_text("\n".join(lines) + "\n")
     declare_whole(files)
-    evidence = Evidence(find(NAME), tmp_path / NAME)
+    evidence = Evidence(EXPERIMENTS[NAME], tmp_path / NAME)
     assert evidence.solved("narrow", "flow").all()
     assert evidence.solved_once("narrow", "flow").all()
     assert evidence.steps_until_solved("narrow", "flow").tolist() == [1500, 1500]
@@ -209,7 +211,7 @@ def test_three_times_the_bar_reaches_the_bar(make_up: MakeUp, tmp_path: Path) ->
 
 def test_who_learns_nothing_is_not_steady(make_up: MakeUp, tmp_path: Path) -> None:
     make_up(NAME, {"flow": 0.0})
-    _, findings = Evidence(find(NAME), tmp_path / NAME).judge()
+    _, findings = Evidence(EXPERIMENTS[NAME], tmp_path / NAME).judge()
     assert [finding.holds for finding in findings] == [False, True, False]
     assert "0 of 10 ever succeed in training" in findings[2].measured
 

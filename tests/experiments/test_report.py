@@ -20,7 +20,7 @@ from sb3_flowpolicy.experiments.experiment import (
     REPRODUCED,
 )
 from sb3_flowpolicy.experiments.figures import outcomes_figure
-from sb3_flowpolicy.experiments.manifest import find
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.report import Section, read_results, write_docs, write_report
 from sb3_flowpolicy.experiments.store import ItemFiles
 from tests.experiments.conftest import MakeUp, declare_whole
@@ -33,7 +33,7 @@ def _few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def evidence(name: str, folder: Path) -> Evidence:
-    return Evidence(find(name), folder / name)
+    return Evidence(EXPERIMENTS[name], folder / name)
 
 
 @pytest.mark.parametrize(

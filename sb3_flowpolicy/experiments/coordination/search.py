@@ -37,14 +37,8 @@ _PRESS_START, _PRESS_STEP = 0.85, 0.3
 class Setting:
     """An environment, an objective, and the length of a search.
 
-    Args:
-        config: The rules of the environment.
-        steps: Steps of an episode.
-        ent_coef: Entropy coefficient.
-        gamma: Discount factor.
-        episodes: Simulated per candidate.
-        budget: Candidates per family.
-        seed: Seed of the search; its random numbers do not depend on it.
+    ``steps`` are those of an episode; ``episodes`` are simulated for each of the ``budget``
+    candidates of a family. The random numbers of the episodes do not depend on ``seed``.
     """
 
     config: SquareConfig

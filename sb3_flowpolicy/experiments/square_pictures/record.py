@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import torch as th
 
 from flowpolicy_envs.square import kernels
@@ -90,8 +91,7 @@ class Recording(NamedTuple):
     @property
     def x_std(self) -> float:
         """Mean over the episodes of the standard deviation of x after the warm-up."""
-        reached = [path[~np.isnan(path)] for path in self.paths]
-        return float(np.mean([path.std() for path in reached if len(path)]))
+        return float(pd.DataFrame(self.paths).std(axis=1, ddof=0).mean())
 
 
 def load_agent(path: Path, env_id: str) -> SACFlow:

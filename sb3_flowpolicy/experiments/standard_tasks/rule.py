@@ -34,10 +34,7 @@ def finals(table: pd.DataFrame) -> pd.Series:
 def difference(ours: np.ndarray, stock: np.ndarray, scale: float = 1.0) -> Estimate:
     """Return the difference of the means as a share of ``scale``, with its 95 % interval.
 
-    Args:
-        ours: One final value per seed, (S,), at least two.
-        stock: The same of the stock policy, (S',).
-        scale: Above 0.
+    ``ours`` and ``stock`` hold a final value per seed, at least two each.
 
     Example:
         >>> print(f"{difference(np.array([110.0, 112.0]), np.array([99.0, 101.0]), 100.0):+.2f}")
