@@ -43,15 +43,13 @@ def main(arguments: list[str] | None = None) -> int:
             "\nInterrupted. The same command continues from the last checkpoint.", file=sys.stderr
         )
         return 130
-    except OSError as error:
+    except (OSError, ValueError, RuntimeError, ModuleNotFoundError) as error:
         advice = (
             ". Finished items are kept; once this is fixed, the same command continues from the "
             "last checkpoint"
         )
-        print(f"error: {error}{advice if args.command is _run else ''}", file=sys.stderr)
-        return 1
-    except (ValueError, RuntimeError, ModuleNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        broken = isinstance(error, OSError) and args.command is _run
+        print(f"error: {error}{advice if broken else ''}", file=sys.stderr)
         return 1
     return 0
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import torch as th
@@ -23,13 +22,13 @@ COLUMNS = ("env", "ent_coef", "seed", "step", "way", "success", "return")
 
 
 def compare(
-    env: str, seeds: Sequence[int], steps: int, every: int, episodes: int, **overrides: Any
+    env: str, seeds: Sequence[int], steps: int, every: int, episodes: int
 ) -> list[dict[str, object]]:
     """Train ``sac_flow`` and test each agent in each way of acting: rows of ``COLUMNS``.
 
-    ``overrides`` go before the hyperparameter file. The environment has to report success.
+    The entropy coefficient is learned. The environment has to report success.
     """
-    settings = {**load_hyperparameters("sac_flow", env), **overrides}
+    settings = {**load_hyperparameters("sac_flow", env), "ent_coef": "auto"}
     del settings["n_timesteps"]
     batch = SeedBatch(settings.pop("policy"), env, seeds, device="cpu", **settings)
     tests = DeterministicEpisodes(env, len(seeds), episodes)
@@ -64,14 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=60_000, help="steps per seed")
     parser.add_argument("--every", type=int, default=10_000, help="steps between two tests")
     parser.add_argument("--episodes", type=int, default=100, help="episodes per test and seed")
-    parser.add_argument("--ent-coef", default="auto", help="a number, or auto: learned")
     parser.add_argument("--csv", type=Path, help="also write the table to this file")
     args = parser.parse_args(arguments)
-    ent_coef = args.ent_coef if args.ent_coef.startswith("auto") else float(args.ent_coef)
     th.set_num_threads(1)
     rows: list[dict[str, object]] = []
     for env in args.envs:
-        rows += compare(env, args.seeds, args.steps, args.every, args.episodes, ent_coef=ent_coef)
+        rows += compare(env, args.seeds, args.steps, args.every, args.episodes)
         if args.csv is not None:
             with replacing(args.csv) as draft:
                 pd.DataFrame(rows).to_csv(draft, index=False)

@@ -89,7 +89,7 @@ class DeterministicEpisodes:
         obs, _ = self.venv.reset(seed=offsets)  # type: ignore[arg-type]
         count = len(offsets)
         returns, running = np.zeros(count), np.ones(count, dtype=bool)
-        success: np.ndarray | None = None
+        success = np.full(count, np.nan)
         while running.any():
             actions = [
                 model.predict(part, deterministic=deterministic)[0]
@@ -99,15 +99,15 @@ class DeterministicEpisodes:
             returns += rewards * running
             ended = (terminated | truncated) & running
             reported = infos.get("final_info", {}).get("is_success")
-            if ended.any() and reported is not None:
-                success = np.zeros(count) if success is None else success
+            if reported is not None:
                 success[ended] = np.asarray(reported)[ended]
             running &= ~ended
         shape = (self.n_models, self.n_episodes)
-        means = returns.reshape(shape).mean(1).tolist()
-        if success is None:
-            return [(mean, None) for mean in means]
-        return list(zip(means, success.reshape(shape).mean(1).tolist(), strict=True))
+        means, rates = returns.reshape(shape).mean(1), success.reshape(shape).mean(1)
+        return [
+            (float(mean), None if np.isnan(rate) else float(rate))
+            for mean, rate in zip(means, rates, strict=True)
+        ]
 
     def close(self) -> None:
         """Close the environments."""

@@ -173,20 +173,12 @@ def write_report(results: Path, page: Path) -> Path:
         sections=sections,
         method=METHOD,
         not_measured=NOT_MEASURED,
-        pictures={s.experiment.name: _inline(s.pictures()) for s in sections},
+        picture=lambda figure: base64.b64encode(png(figure, dpi=90)).decode(),
         date=datetime.now(timezone.utc).date().isoformat(),
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     write_text(page, text)
     return page
-
-
-def _inline(figures: dict[str, Figure]) -> dict[str, str]:
-    """Return figures as data URLs."""
-    return {
-        name: "data:image/png;base64," + base64.b64encode(png(figure, dpi=90)).decode()
-        for name, figure in figures.items()
-    }
 
 
 def write_docs(results: Path, docs: Path) -> Path:

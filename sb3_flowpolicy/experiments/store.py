@@ -76,9 +76,6 @@ def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "settings.json"
     if not path.exists():
-        strays = [one.name for one in folder.glob("*.csv")]
-        if strays:
-            raise ValueError(f"{folder} must be new or have its settings.json, got only {strays}")
         return write_json(path, settings)
     found, wanted = read_json(path), json.loads(json.dumps(settings))
     if found != wanted:

@@ -61,14 +61,14 @@ def facts(evidence: Evidence) -> dict[str, str]:
     seeds = evidence.settings.get("seeds", [])
     steps = evidence.settings.get("steps", experiment.steps)
     command = f"python -m sb3_flowpolicy.experiments run {experiment.name}"
-    if steps != experiment.steps:
-        command += f" --steps {steps}"
-    if seeds and len(seeds) != experiment.seeds:
-        command += f" --seeds {len(seeds)}"
-    if seeds and seeds[0] != FIRST_SEED:
-        command += f" --first-seed {seeds[0]}"
     found = {"command": command}
     if evidence.items:
+        for option, value, usual in (
+            ("steps", steps, experiment.steps),
+            ("seeds", len(seeds), experiment.seeds),
+            ("first-seed", seeds[0], FIRST_SEED),
+        ):
+            found["command"] += f" --{option} {value}" if value != usual else ""
         found["seeds"] = f"{seeds[0]} to {seeds[-1]}, {steps:,} steps each"
         found["items"] = f"{len(done)} of {len(evidence.items)} finished"
     if done:

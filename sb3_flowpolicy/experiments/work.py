@@ -230,13 +230,8 @@ def environment(item: WorkItem) -> str:
     parts = [f"{key}_{value}" for key, value in sorted(item.env_kwargs.items())]
     name = f"{base.name}-{'-'.join(parts)}-v{base.version}"
     if name not in gym.registry:
-        gym.register(
-            id=name,
-            entry_point=base.entry_point,
-            vector_entry_point=base.vector_entry_point,
-            max_episode_steps=base.max_episode_steps,
-            kwargs={**base.kwargs, **item.env_kwargs},
-        )
+        kwargs = {**base.kwargs, **item.env_kwargs}
+        gym.registry[name] = replace(base, id=name, kwargs=kwargs)
     return name
 
 

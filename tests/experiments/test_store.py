@@ -65,9 +65,7 @@ def test_a_folder_keeps_to_its_settings(tmp_path: Path) -> None:
         claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 3)}}})
 
 
-def test_a_folder_of_unknown_origin_is_refused(tmp_path: Path, files: ItemFiles) -> None:
-    with pytest.raises(ValueError, match=r"must be new or have its settings\.json"):
-        claim_folder(tmp_path, {"steps": 100})
+def test_damaged_settings_are_refused(tmp_path: Path) -> None:
     (tmp_path / "settings.json").write_text("{")
     with pytest.raises(ValueError, match=r"settings\.json must be JSON, got Expecting"):
         claim_folder(tmp_path, {"steps": 100})
