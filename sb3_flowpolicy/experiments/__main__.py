@@ -10,18 +10,9 @@ import sys
 from pathlib import Path
 
 from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least
+from sb3_flowpolicy.experiments import work
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
 from sb3_flowpolicy.experiments.runner import Progress, results_folder, run_local, unfinished
-from sb3_flowpolicy.experiments.work import (
-    FIRST_SEED,
-    QUICK_SEEDS,
-    QUICK_STEPS,
-    SEEDS_PER_ITEM,
-    in_words,
-    make_plan,
-    plan_seconds,
-    vary,
-)
 
 OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")}
 
@@ -59,9 +50,9 @@ def _list(args: argparse.Namespace) -> None:
     head = ("experiment", "claim", "agents", "settings", "steps", "seeds", "time")
     print(line.format(*head, "what it compares"))
     for one in EXPERIMENTS.values():
-        missing, plan = what_is_missing(one), make_plan(one, args.profile)
+        missing, plan = what_is_missing(one), work.make_plan(one, args.profile)
         sizes = len(one.agents), len(one.settings), f"{plan.steps:,}", len(plan.seeds)
-        time = in_words(plan_seconds(plan, args.workers))
+        time = work.in_words(work.plan_seconds(plan, args.workers))
         needs = f" [needs {missing}]" if missing else ""
         print(line.format(one.name, one.claim, *sizes, time, one.title + needs))
     print(
@@ -71,23 +62,24 @@ def _list(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    experiment = vary(EXPERIMENTS[args.name], dict(args.set), args.agents)
+    experiment = work.vary(EXPERIMENTS[args.name], dict(args.set), args.agents)
     missing = what_is_missing(experiment)
     if missing:
         raise ValueError(f"{experiment.name} needs {missing}, which is not installed")
     if args.address is not None and args.backend != "ray":
         raise ValueError(f"--address needs --backend ray, got {args.backend!r}")
-    plan = make_plan(
+    plan = work.make_plan(
         experiment, args.profile, args.steps, args.seeds, args.first_seed, args.seeds_per_item
     )
     out = args.out or OUT[args.profile]
     with results_folder(out, plan) as folder:
         items = unfinished(folder, plan)
         finished = {item.key for item in plan.items} - {item.key for item in items}
+        time = work.in_words(work.plan_seconds(plan, args.workers))
         print(
             f"{experiment.name} ({experiment.claim}): {len(plan.items)} items of {plan.steps:,} "
             f"steps x {len(plan.items[0].seeds)} seeds, {len(finished)} finished before, "
-            f"about {in_words(plan_seconds(plan, args.workers))} in all on {args.workers} cores\n"
+            f"about {time} in all on {args.workers} cores\n"
             f"Results: {folder}"
         )
         if items:
@@ -134,11 +126,11 @@ def _parser() -> argparse.ArgumentParser:
     report.set_defaults(command=_report)
     add, count = run.add_argument, at_least(1)
     add("name", metavar="NAME", choices=EXPERIMENTS, help="experiment; `list` shows them")
-    seeds = f"number of seeds (default: the experiment's; quick: {QUICK_SEEDS})"
+    seeds = f"number of seeds (default: the experiment's; quick: {work.QUICK_SEEDS})"
     add("--seeds", type=count, help=seeds)
     first = "1 for results, 100 for tuning"
-    add("--first-seed", type=at_least(0), default=FIRST_SEED, help=first)
-    steps = f"steps per seed (default: the experiment's; quick: {QUICK_STEPS})"
+    add("--first-seed", type=at_least(0), default=work.FIRST_SEED, help=first)
+    steps = f"steps per seed (default: the experiment's; quick: {work.QUICK_STEPS})"
     add("--steps", type=count, help=steps)
     add("--agents", nargs="+", metavar="AGENT", help="only these agents")
     values = "arguments of all environments, for tuning (YAML values)"
@@ -148,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     outs = " or ".join(map(str, OUT.values()))
     add("--out", type=Path, help=f"folder for results (default: {outs}, by profile)")
     together = "seeds trained together in a process; fewer spread over more machines"
-    add("--seeds-per-item", type=count, default=SEEDS_PER_ITEM, help=together)
+    add("--seeds-per-item", type=count, default=work.SEEDS_PER_ITEM, help=together)
     add("--no-progress", action="store_true", help="show no progress bars")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     for command in (show, run):

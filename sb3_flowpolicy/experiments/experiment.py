@@ -22,22 +22,26 @@ class Agent:
         name: Name in commands and file names.
         label: Name in figures.
         algo: File of ``zoo_hyperparams`` that holds its hyperparameters.
+        color: Its color in all figures. Those of the thesis's agents remain distinct in print and
+            for color-blind readers (Okabe and Ito); there are not ten such colors.
         overrides: What differs from that file, merged into nested mappings.
     """
 
     name: str
     label: str
     algo: str
+    color: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
-GAUSS = Agent("gauss", "Gauss", "sac_gauss")
-LOW_RANK = Agent("lowrank", "LR", "sac_lowrank")
-FLOW = Agent("flow", "NF", "sac_flow")
+GAUSS = Agent("gauss", "Gauss", "sac_gauss", "#d55e00")
+LOW_RANK = Agent("lowrank", "LR", "sac_lowrank", "#009e73")
+FLOW = Agent("flow", "NF", "sac_flow", "#0072b2")
 FLOW_DEFAULT_INIT = Agent(
     "flow-default-init",
     "NF, torch's initialization",
     "sac_flow",
+    "#cc79a7",
     {"policy_kwargs": {"distribution_kwargs": {"init": "default"}}},
 )
 AGENTS = (GAUSS, LOW_RANK, FLOW)

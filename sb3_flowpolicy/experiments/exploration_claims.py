@@ -23,18 +23,19 @@ def _density(name: str) -> dict[str, Any]:
     return {"policy_kwargs": {"distribution": name}}
 
 
-GAUSS_PINK = Agent("gauss-pink", "Gauss, pink noise", "sac_gauss", _PINK)
+GAUSS_PINK = Agent("gauss-pink", "Gauss, pink noise", "sac_gauss", "#8c2d04", _PINK)
 # SB3 draws gSDE's noise once per rollout: with train_freq=1 it would be white.
-GSDE = Agent("gsde", "gSDE", "sac_gauss", {"use_sde": True, "train_freq": 8, "gradient_steps": 8})
-LATTICE = Agent("lattice", "Lattice", "sac_gauss", _density("lattice"))
+GSDE = Agent(
+    "gsde", "gSDE", "sac_gauss", "#999999", {"use_sde": True, "train_freq": 8, "gradient_steps": 8}
+)
+LATTICE = Agent("lattice", "Lattice", "sac_gauss", "#f0e442", _density("lattice"))
 FULL_COVARIANCE = Agent(
-    "full-covariance", "full covariance", "sac_gauss", _density("full_covariance")
+    "full-covariance", "full covariance", "sac_gauss", "#66c2a5", _density("full_covariance")
 )
-FLOW_PINK = Agent("flow-pink", "NF, pink noise", "sac_flow", _PINK)
-SPLINE = Agent("spline", "spline", "sac_flow", _density("spline"))
-SPLINE_PINK = Agent(
-    "spline-pink", "spline, pink noise", "sac_flow", {**_density("spline"), **_PINK}
-)
+FLOW_PINK = Agent("flow-pink", "NF, pink noise", "sac_flow", "#56b4e9", _PINK)
+SPLINE = Agent("spline", "spline", "sac_flow", "#6a3d9a", _density("spline"))
+_SPLINE_PINK = {**_density("spline"), **_PINK}
+SPLINE_PINK = Agent("spline-pink", "spline, pink noise", "sac_flow", "#cab2d6", _SPLINE_PINK)
 
 EXPLORERS = (
     *(GAUSS, GAUSS_PINK, GSDE, LATTICE, LOW_RANK, FULL_COVARIANCE),

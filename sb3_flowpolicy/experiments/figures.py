@@ -1,49 +1,34 @@
-"""Still figures: curves as in the thesis (figures 3.5, 3.7, 3.9, ...), profiles and outcomes."""
+"""Figures: curves, profiles, outcomes, and policies (thesis figures 3.2 to 3.11)."""
 
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap
 
+import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.common.statistics import interquartile_mean
-from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.diagnostics.figures import POLICY_BLUE, new_figure
 from sb3_flowpolicy.experiments.evidence import Evidence
-from sb3_flowpolicy.experiments.experiment import Agent
+from sb3_flowpolicy.experiments.experiment import FLOW, Agent
 from sb3_flowpolicy.experiments.tables import WORDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The thesis's agents have colors that remain distinct in print and for color-blind readers (Okabe
-# and Ito); there are not ten such colors.
-COLORS = {
-    "gauss": "#d55e00",
-    "lowrank": "#009e73",
-    "flow": "#0072b2",
-    "flow-default-init": "#cc79a7",
-    "gauss-pink": "#8c2d04",
-    "gsde": "#999999",
-    "lattice": "#f0e442",
-    "full-covariance": "#66c2a5",
-    "flow-pink": "#56b4e9",
-    "spline": "#6a3d9a",
-    "spline-pink": "#cab2d6",
-}
 # Fields above this share are so dark that their text has to be white.
 _DARK = 0.6
 PANELS = ("train_return", "test_return", "test_success", "entropy", "ent_coef")
+_WALL, _GOAL = "#d62728", "#78c878"
+_VIEW = 1.6
+"""Half the edge of a view of the agent, in reaches."""
 SMOOTHED_OVER = 3
 """Evaluations that a drawn point averages; numbers in tables are not smoothed."""
-
-
-def color(agent: Agent) -> str:
-    """Return the color of an agent in all figures."""
-    return COLORS.get(agent.name, "#555555")
 
 
 def panels(evidence: Evidence) -> list[str]:
@@ -72,7 +57,7 @@ def curves_figure(evidence: Evidence) -> Figure:
             for agent in experiment.agents:
                 if metric in evidence.columns(setting.name, agent.name):
                     curves = evidence.curves(setting.name, agent.name, metric)
-                    draw_seeds(axes, smoothed(curves), color(agent), agent.label)
+                    draw_seeds(axes, smoothed(curves), agent.color, agent.label)
             _style(axes)
             axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x else "0")
             axes.set_xlim(left=0)
@@ -129,7 +114,7 @@ def profile_figure(evidence: Evidence) -> Figure | None:
     column = figure.subplots(len(found), 1, squeeze=False)[:, 0]
     for axes, profiles in zip(column, found.values(), strict=True):
         for agent, profile in profiles:
-            draw_seeds(axes, profile, color(agent), agent.label)
+            draw_seeds(axes, profile, agent.color, agent.label)
         axes.set_xlabel("share of the way from start to goal, on the centre line", fontsize=8)
         axes.set_ylabel("entropy (nats)", fontsize=8)
         _style(axes)
@@ -165,7 +150,7 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
         axes.text(column, row, text, ha="center", va="center", fontsize=8, color=shade)
     if np.isnan(shares).all():
         return None
-    white_to_blue = LinearSegmentedColormap.from_list("shares", ["white", COLORS["flow"]])
+    white_to_blue = LinearSegmentedColormap.from_list("shares", ["white", FLOW.color])
     fields = np.arange(columns), np.arange(rows)  # their centers
     axes.pcolormesh(
         *fields, shares, cmap=white_to_blue, vmin=0, vmax=1, edgecolors="white", linewidth=3
@@ -178,3 +163,76 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
     axes.spines[:].set_visible(False)
     axes.set_title("seeds that solve it at the end,\nand steps until they first do", fontsize=9)
     return figure
+
+
+def policies_figure(evidence: Evidence) -> Figure | None:
+    """Draw each agent's action samples at several states of one test episode.
+
+    A row per setting, agent and moment of training; first the whole episode, then views of the
+    agent at several of its states.
+    """
+    rows = [
+        (setting, agent, picture)
+        for setting in evidence.experiment.settings
+        for agent in evidence.experiment.agents
+        for picture in evidence.pictures(setting.name, agent.name)
+    ]
+    if not rows:
+        return None
+    columns = 1 + max(len(picture["steps"]) for _, _, picture in rows)
+    figure = new_figure(2.0 * columns + 0.4, 2.15 * len(rows))
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    several = len(evidence.experiment.settings) > 1
+    for line, (setting, agent, picture) in zip(grid, rows, strict=True):
+        env = gym.make(setting.env_id, **setting.env_kwargs).unwrapped
+        for axes in line:
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_color("#dddddd")
+        for axes in line[1 + len(picture["steps"]) :]:
+            axes.set_axis_off()
+        _draw_tunnel(line[0], env)
+        trail = np.array(picture["trail"])
+        line[0].plot(*trail.T, color="black", linewidth=0.6, marker=".", markersize=3)
+        line[0].set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
+        line[0].set_title("the episode", fontsize=7)
+        for k, axes in zip(range(len(picture["steps"])), line[1:], strict=False):
+            _draw_policy(axes, env, picture, k)
+        where = f"{setting.name}, " if several else ""
+        line[0].set_ylabel(
+            f"{where}{agent.label}\nseed {picture['seed']}, {picture['step'] / 1000:g}k steps",
+            fontsize=7,
+        )
+    return figure
+
+
+def _draw_tunnel(axes: Axes, env: Any) -> None:
+    config = env.config
+    path = config.geometry
+    low, high = path.ends
+    centre = path.polyline(low, high)
+    along = np.gradient(centre, axis=0)
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    across *= config.width / 2 / np.linalg.norm(across, axis=1, keepdims=True)
+    goal = path.polyline(*path.goal_arcs)
+    axes.plot(*goal.T, color=_GOAL, linewidth=5, solid_capstyle="butt")
+    for side in (-1, 1):
+        axes.plot(*(centre + side * across).T, color=_WALL, linewidth=0.7)
+
+
+def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:
+    from matplotlib.patches import Rectangle
+
+    x, y = picture["positions"][k]
+    trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
+    reach, view = env.config.reach, _VIEW * env.config.reach
+    ends = (x, y) + reach * np.array(picture["samples"][k])
+    corner = x - reach, y - reach
+    _draw_tunnel(axes, env)
+    axes.scatter(trail[:, 0], trail[:, 1], s=4, color="#969696", linewidths=0)
+    axes.add_patch(
+        Rectangle(corner, 2 * reach, 2 * reach, fill=False, edgecolor="#aaaaaa", linewidth=0.7)
+    )
+    axes.scatter(ends[:, 0], ends[:, 1], s=2.5, color=POLICY_BLUE, alpha=0.6, linewidths=0)
+    axes.scatter(x, y, s=10, color="black", zorder=3)
+    axes.set(xlim=(x - view, x + view), ylim=(y - view, y + view), aspect="equal")
+    axes.set_title(f"step {picture['steps'][k]}", fontsize=7)

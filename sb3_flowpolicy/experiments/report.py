@@ -17,6 +17,7 @@ import pandas as pd
 from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.common.statistics import RESAMPLES
 from sb3_flowpolicy.experiments import evidence as definitions
+from sb3_flowpolicy.experiments import figures, work
 from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import (
     NOT_MEASURED,
@@ -25,17 +26,9 @@ from sb3_flowpolicy.experiments.experiment import (
     REPRODUCED,
     Experiment,
 )
-from sb3_flowpolicy.experiments.figures import (
-    SMOOTHED_OVER,
-    curves_figure,
-    outcomes_figure,
-    profile_figure,
-)
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
-from sb3_flowpolicy.experiments.policy_pictures import policies_figure
 from sb3_flowpolicy.experiments.store import differences
 from sb3_flowpolicy.experiments.tables import facts, markdown, results_table
-from sb3_flowpolicy.experiments.work import FIRST_SEED, in_words, make_plan, plan_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,9 +59,9 @@ METHOD = (
     f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the entropy coefficient, "
     "from the first training success on; the curve with the fewest decides. Logs of unequal "
     "length are interpolated to a common grid that ends with the shortest. "
-    f"Curves are drawn as means over {SMOOTHED_OVER} measurements. A claim is reproduced if all "
-    "lines of its rule hold, not reproduced if none does, partly reproduced otherwise. Our own "
-    "experiments have no claim to reproduce; each line of their rules describes one agent."
+    f"Curves are drawn as means over {figures.SMOOTHED_OVER} measurements. A claim is reproduced "
+    "if all lines of its rule hold, not reproduced if none does, partly reproduced otherwise. Our "
+    "own experiments have no claim to reproduce; each line of their rules describes one agent."
 )
 
 _OURS_IN_WORDS = {
@@ -88,7 +81,7 @@ class Section:
         self.table = results_table(evidence) if self.measured else None
         self.facts = facts(evidence)
         self.missing = what_is_missing(self.experiment)
-        self.estimate = in_words(plan_seconds(make_plan(self.experiment), 2))
+        self.estimate = work.in_words(work.plan_seconds(work.make_plan(self.experiment), 2))
         # Trials must not be taken for results.
         self.reservation = (
             reservation(self.experiment, evidence.settings) if evidence.items else None
@@ -112,24 +105,26 @@ class Section:
         if not self.measured:
             return {}
         found = {
-            "outcomes": outcomes_figure(self.evidence),
-            "curves": curves_figure(self.evidence),
-            "profile": profile_figure(self.evidence),
-            "policies": policies_figure(self.evidence),
+            "outcomes": figures.outcomes_figure(self.evidence),
+            "curves": figures.curves_figure(self.evidence),
+            "profile": figures.profile_figure(self.evidence),
+            "policies": figures.policies_figure(self.evidence),
         }
         return {name: figure for name, figure in found.items() if figure is not None}
 
 
 def reservation(experiment: Experiment, settings: Mapping[str, Any]) -> str | None:
     """Explain why results with these settings are not the experiment's own, None if they are."""
-    planned = make_plan(experiment)
+    planned = work.make_plan(experiment)
     seeds = settings["seeds"]
     if settings["steps"] < planned.steps or len(seeds) < len(planned.seeds):
         return "trial, not a result"
-    if seeds[0] != FIRST_SEED:
+    if seeds[0] != work.FIRST_SEED:
         return f"seeds from {seeds[0]} on, which are for tuning: not a result"
     together = max(len(item["seeds"]) for item in settings["items"].values())
-    same = make_plan(experiment, steps=settings["steps"], seeds=len(seeds), seeds_per_item=together)
+    same = work.make_plan(
+        experiment, steps=settings["steps"], seeds=len(seeds), seeds_per_item=together
+    )
     wanted = json.loads(json.dumps(same.settings()))
     if settings != wanted:
         return f"made with other settings ({differences(dict(settings), wanted)[0]})"

@@ -16,14 +16,7 @@ from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.common.machine import machine
 from sb3_flowpolicy.engine.runtime import UPDATES_WORTH_COMPILING
-from sb3_flowpolicy.experiments.measures import (
-    TRAINING_INFOS,
-    DeterministicEpisodes,
-    entropy_profile,
-    policy_entropy,
-    policy_picture,
-    same_axis_correlation,
-)
+from sb3_flowpolicy.experiments import measures
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import WorkItem, environment
 from sb3_flowpolicy.seeds.batch import SeedBatch
@@ -79,7 +72,7 @@ class _Training:
         # gSDE is not a density but part of SB3's actor, so its seeds cannot be stacked.
         self.stacked = not item.hyperparameters.get("use_sde")
         self.groups = [item.seeds] if self.stacked else [(seed,) for seed in item.seeds]
-        self.infos = [name for name in TRAINING_INFOS if name in item.measures]
+        self.infos = [name for name in measures.TRAINING_INFOS if name in item.measures]
         self.started, self.cpu_started = time.perf_counter(), time.process_time()
         # Of earlier sessions.
         self.before: dict[str, Any] = {"seconds": 0, "cpu_seconds": 0, "sessions": 0, "commits": []}
@@ -115,7 +108,7 @@ class _Training:
         models = learner.models if isinstance(learner, SeedBatch) else [learner]
         stage = vars(models[0]).get(_PROGRESS, {"start": 0})["start"]
         self._tell(group, stage)
-        tests = DeterministicEpisodes(self.env, len(models), item.test_episodes)
+        tests = measures.DeterministicEpisodes(self.env, len(models), item.test_episodes)
         first = True
         while stage < item.steps:
             end = min(stage + item.eval_every, item.steps)
@@ -140,11 +133,11 @@ class _Training:
             tested = tests.run(models, self.groups[group])
             self.files.append_rows([self._row(*one) for one in zip(models, tested, strict=True)])
             if group == 0 and any(stage < at <= done for at in item.pictures_at):
-                self._record("picture", policy_picture, models[:1])
+                self._record("picture", measures.policy_picture, models[:1])
             stage = done
             self._tell(group, stage)
         if "profile" in item.measures:
-            self._record("profile", entropy_profile, models)
+            self._record("profile", measures.entropy_profile, models)
         tests.close()
         if group == 0:
             # To draw pictures of; before the item is declared complete.
@@ -206,12 +199,12 @@ class _Training:
             "train_success": _mean(list(success)),
             "test_return": tested[0],
             "test_success": tested[1],
-            "entropy": policy_entropy(model, seed),
+            "entropy": measures.policy_entropy(model, seed),
             "ent_coef": _ent_coef(model),
         }
         row |= {name: _mean([episode[name] for episode in episodes]) for name in self.infos}
         if "same_axis_correlation" in self.item.measures:
-            row["same_axis_correlation"] = same_axis_correlation(model, seed)
+            row["same_axis_correlation"] = measures.same_axis_correlation(model, seed)
         episodes.clear()
         success.clear()
         return row

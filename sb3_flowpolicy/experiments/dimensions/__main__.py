@@ -63,14 +63,14 @@ def _draw(table: pd.DataFrame, path: Path, survival: float) -> None:
     """Draw entropy and progress by number of dimensions."""
     # Slow imports that the table does not need.
     from sb3_flowpolicy.diagnostics.figures import new_figure
-    from sb3_flowpolicy.experiments.figures import COLORS
+    from sb3_flowpolicy.experiments.experiment import GAUSS, LOW_RANK
 
     figure = new_figure(9.0, 3.4)
     left, right = figure.subplots(1, 2)
     for label, name, shade in (
         ("any density", "bound", "#555555"),
-        ("LR (any rank), full covariance", "correlated", COLORS["lowrank"]),
-        ("Gauss", "independent", COLORS["gauss"]),
+        ("LR (any rank), full covariance", "correlated", LOW_RANK.color),
+        ("Gauss", "independent", GAUSS.color),
     ):
         entropy = table.get(f"{name}.entropy", table["bound"])
         left.plot(entropy - table["uniform"], "o-", color=shade, label=label, markersize=4)
