@@ -10,7 +10,8 @@ _DESCRIPTION = """\
 Train SAC, TQC, CrossQ, or PPO with its own policy and with ours on a standard task, with the same
 settings: those that rl_zoo3 publishes, without gSDE and for fewer steps. Every test is written to a
 CSV file. Runs that are in the file are not repeated, so an interrupted command continues. Give each
-of several processes a file of its own, and all files to the last command."""
+of several processes a file of its own, and all files to the last command. Needs the extras
+[zoo] and [bullet]."""
 COLUMNS = [
     *("task", "algorithm", "policy", "seed"),
     *("step", "test_return", "test_success", "seconds"),
