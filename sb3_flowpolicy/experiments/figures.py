@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -102,9 +101,8 @@ def _style(axes: Axes) -> None:
 
 def profile_figure(evidence: Evidence) -> Figure | None:
     """Draw the entropy along the way to the goal at the end of training (thesis Fig. 3.8)."""
-    experiment = evidence.experiment
     found: dict[str, list[tuple[Agent, pd.DataFrame]]] = {}
-    for setting, agent in itertools.product(experiment.settings, experiment.agents):
+    for setting, agent in evidence.measured:
         profile = evidence.profile(setting.name, agent.name)
         if profile is not None:
             found.setdefault(setting.name, []).append((agent, profile))
@@ -173,8 +171,7 @@ def policies_figure(evidence: Evidence) -> Figure | None:
     """
     rows = [
         (setting, agent, picture)
-        for setting in evidence.experiment.settings
-        for agent in evidence.experiment.agents
+        for setting, agent in evidence.measured
         for picture in evidence.pictures(setting.name, agent.name)
     ]
     if not rows:

@@ -139,12 +139,10 @@ def read_results(results: Path) -> list[Evidence]:
     """
 
     @functools.cache
-    def one(name: str) -> Evidence | None:
-        if name not in EXPERIMENTS:
-            return None
+    def one(name: str) -> Evidence:
         return Evidence(EXPERIMENTS[name], results / name, one)
 
-    found = [evidence for name in EXPERIMENTS if (evidence := one(name)) is not None]
+    found = [one(name) for name in EXPERIMENTS]
     if not any(evidence.items for evidence in found):
         raise ValueError(
             f"{results} must hold the results of at least one experiment, got none: "
