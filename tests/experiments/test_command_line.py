@@ -95,7 +95,7 @@ def test_counts_are_at_least_one(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
-        main(["run", "tiny", option, "0", "--out", str(tmp_path)])
+        main(["run", "move", option, "0", "--out", str(tmp_path)])
     assert f"argument {option}: value must be an integer of at least 1" in capsys.readouterr().err
 
 
