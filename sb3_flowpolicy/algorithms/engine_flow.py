@@ -41,7 +41,6 @@ from sb3_flowpolicy.engine.replay import COLUMNS, is_plain
 from sb3_flowpolicy.engine.update import Objective
 from sb3_flowpolicy.guard import NonFiniteError, TrainingGuard
 from sb3_flowpolicy.guard.finite import (
-    ENVIRONMENT,
     check_experience,
     check_observation,
     check_step,
@@ -330,7 +329,7 @@ class EngineFlow(OffPolicyAlgorithm):
         self._guard.restart(self._checkpoints.path)
         normalized = self._vec_normalize_env is not None
         first = self._last_original_obs if normalized else self._last_obs
-        check_experience({"observations": first}, self.num_timesteps, ENVIRONMENT)
+        check_experience({"observations": first}, self.num_timesteps)
         self._runtime.plan(self._n_updates, self._planned_updates(total_timesteps))
         return total_timesteps, callback
 

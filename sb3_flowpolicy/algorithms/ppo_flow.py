@@ -126,10 +126,7 @@ class PPOFlow(PPO):
                 value = float(found[~np.isfinite(found)][0])
                 raise NonFiniteError(
                     f"{name} must be finite, got {value} in the rollout that ends at step "
-                    f"{self.num_timesteps}; nothing was learned from it",
-                    name,
-                    value,
-                    self.num_timesteps,
+                    f"{self.num_timesteps}; nothing was learned from it"
                 )
         # Otherwise a tenth of the time would go into an entropy that is multiplied by 0.
         if isinstance(self.policy, on_policy.DensityActorCritic):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,39 +11,8 @@ import numpy as np
 _SURELY_FINITE = 1e76
 
 
-ENVIRONMENT = "environment {}".format
-
-
 class NonFiniteError(ValueError):
-    """A value is NaN or infinite, or too large for float32.
-
-    Args:
-        message: What happened, and what to do about it.
-        tensor: Name of the value: a loss, a parameter, ``"rewards"``, ...
-        value: NaN or infinity.
-        step: Environment steps done.
-        update: Update in which it happened, from 1; None if it was not in an update.
-        seed: Seed of the agent; None if it has none.
-        batch: Summary of the minibatch of that update, by column: ``"low"`` and ``"high"`` of the
-            finite values, how many are ``"not_finite"``, and the ``"row"`` of the first of these,
-            or else of the largest; empty if the minibatch is not known.
-        restored: Number of updates before the weights that were restored; None if none were.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        tensor: str = "",
-        value: float = float("nan"),
-        step: int | None = None,
-        update: int | None = None,
-        seed: int | None = None,
-        batch: Mapping[str, Mapping[str, float]] | None = None,
-        restored: int | None = None,
-    ) -> None:
-        super().__init__(message)
-        self.tensor, self.value, self.step, self.update = tensor, value, step, update
-        self.seed, self.batch, self.restored = seed, dict(batch or {}), restored
+    """A value is NaN or infinite, or too large for float32; the message says which and where."""
 
 
 def all_finite(values: np.ndarray) -> bool:
@@ -64,15 +33,12 @@ def all_finite(values: np.ndarray) -> bool:
 
 def check_observation(observation: Any) -> None:
     """Raise :class:`NonFiniteError` if an observation to act on is not finite."""
-    for name, values in _arrays("observation", observation):
-        if not all_finite(values):
-            at, value = _first(values)
-            raise NonFiniteError(
-                f"{name} must be finite in float32, got {value} at index {at}", name, value
-            )
+    _check("observation", observation, lambda at: f"at index {at}")
 
 
-def check_experience(columns: Mapping[str, Any], step: int, who: Callable[[int], str]) -> None:
+def check_experience(
+    columns: Mapping[str, Any], step: int, who: Callable[[int], str] = "environment {}".format
+) -> None:
     """Reject non-finite values from environments before they enter a replay buffer.
 
     Args:
@@ -85,26 +51,14 @@ def check_experience(columns: Mapping[str, Any], step: int, who: Callable[[int],
 
     Example:
         >>> columns = {"observations": np.zeros((2, 3)), "rewards": np.array([0.0, np.nan])}
-        >>> check_experience(columns, 7, ENVIRONMENT)
+        >>> check_experience(columns, 7)
         Traceback (most recent call last):
         ...
         sb3_flowpolicy.guard.finite.NonFiniteError: rewards must be finite in float32, got nan \
-from environment 1 at step 7; nothing of this step was stored
+from environment 1 at step 7, index (1,); nothing of this step was stored
     """
-    for column, value in columns.items():
-        if isinstance(value, np.ndarray) and all_finite(value):
-            continue
-        for name, values in _arrays(column, value):
-            if not all_finite(values):
-                at, number = _first(values)
-                element = f", element {at[1] if len(at) == 2 else at[1:]}," if len(at) > 1 else ""
-                raise NonFiniteError(
-                    f"{name} must be finite in float32, got {number} from {who(at[0])}{element} "
-                    f"at step {step}; nothing of this step was stored",
-                    name,
-                    number,
-                    step,
-                )
+    for name, value in columns.items():
+        _check(name, value, lambda at: _origin(who(at[0]), step, at))
 
 
 def check_step(
@@ -126,34 +80,26 @@ def check_step(
     Raises:
         NonFiniteError: As :func:`check_experience`.
     """
-    # The ordinary step takes as few calls as possible: between two updates the cache is cold.
-    ordinary = type(observations) is np.ndarray and observations.dtype.kind == "f"
-    seen = observations.ravel() if ordinary else rewards
-    if not float(seen.dot(seen)) + float(rewards.dot(rewards)) < _SURELY_FINITE or not ordinary:
-        columns = {"observations": observations, "rewards": rewards}
-        check_experience(columns, step, ENVIRONMENT)
-    if not any(dones):
-        return
-    for index, (done, info) in enumerate(zip(dones, infos, strict=True)):
-        if done and info.get("terminal_observation") is not None:
-            last = info["terminal_observation"]
-            parts = last if isinstance(last, Mapping) else {"": last}
-            one = {key: np.asarray(part)[None] for key, part in parts.items()}
-            who = f"environment {index}"
-            check_experience({"final observations": one}, step, lambda _, who=who: who)  # type: ignore[misc]
+    check_experience({"observations": observations, "rewards": rewards}, step)
+    for index, done in enumerate(dones):
+        if done and infos[index].get("terminal_observation") is not None:
+            who, last = f"environment {index}", infos[index]["terminal_observation"]
+            _check("final observations", last, lambda at, who=who: _origin(who, step, at))  # type: ignore[misc]
 
 
-def _arrays(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
+def _origin(who: str, step: int, at: tuple[int, ...]) -> str:
+    return f"from {who} at step {step}, index {at}; nothing of this step was stored"
+
+
+def _check(name: str, value: Any, where: Callable[[tuple[int, ...]], str]) -> None:
     if isinstance(value, Mapping):
         for key, part in value.items():
-            yield f"{name}[{key!r}]" if key else name, np.asarray(part)
-    else:
-        yield name, np.asarray(value)
-
-
-def _first(values: np.ndarray) -> tuple[tuple[int, ...], float]:
-    """Return the index of the first non-finite value, and the value."""
+            _check(f"{name}[{key!r}]", part, where)
+        return
+    values = np.asarray(value)
+    if all_finite(values):
+        return
     with np.errstate(over="ignore"):
-        bad = ~np.isfinite(values.astype(np.float32))
-    at = tuple(int(i) for i in np.argwhere(bad)[0])
-    return at, float(values[at])
+        first = np.argwhere(~np.isfinite(values.astype(np.float32)))[0]
+    at = tuple(first.tolist())
+    raise NonFiniteError(f"{name} must be finite in float32, got {values[at]} {where(at)}")

@@ -34,11 +34,10 @@ def test_other_algorithms_go_back_as_well(algorithm: Any) -> None:
     model.learn(30)
     model.train(0)
     model.replay_buffer.rewards[:] = np.inf
-    with pytest.raises(
-        NonFiniteError, match=r"critic_loss must be finite, got .*rewards"
-    ) as caught:
+    # The weights are those that it last looked at and kept.
+    message = r"critic_loss must be finite, got .*rewards.* back at update 0\."
+    with pytest.raises(NonFiniteError, match=message):
         model.train(2, 16)
-    assert caught.value.restored == 0  # what it last looked at and kept
     after = model.policy.state_dict()
     changed = {name for name, value in before.items() if not th.equal(value, after[name])}
     assert not {name for name in changed if not name.endswith(".steps")}  # CrossQ's warm-up

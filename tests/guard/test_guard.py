@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -72,17 +72,15 @@ def size(model: SACFlow) -> int:
     ("what", "message"),
     [
         ("rewards", "rewards must be finite in float32, got {} from environment 0 at step 20"),
-        ("observations", r"observations must be .* got {} from environment 0, element 1, at step"),
-        ("final", r"final observations must .* got {} from environment 0, element 1, at step 20"),
+        ("observations", r"observations .* got {} from environment 0 at step 20, index \(0, 1\)"),
+        ("final", r"final observations .* got {} from environment 0 at step 20, index \(1,\);"),
     ],
 )
 def test_environments_are_not_believed(what: str, message: str, value: float) -> None:
     model = SACFlow("FlowPolicy", Faulty(what, value), compile=False, **SEEDED)
-    with pytest.raises(NonFiniteError, match=message.format(value)) as caught:
+    with pytest.raises(NonFiniteError, match=message.format(value)):
         model.learn(50)
     assert size(model) == 19
-    assert caught.value.step == 20
-    assert caught.value.tensor.endswith("rewards" if what == "rewards" else "observations")
     assert all_finite(model.policy.parameters_to_vector())
 
 
@@ -92,7 +90,9 @@ def test_the_first_observation_counts() -> None:
     # Of two environments per agent the second is the one that is stepped.
     values = iter([0.0, np.nan])
     batch = SeedBatch("FlowPolicy", lambda: Faulty("reset", next(values)), [4], **FAST)
-    with pytest.raises(NonFiniteError, match=r"observations .* from seed 4, element 1, at step 0"):
+    with pytest.raises(
+        NonFiniteError, match=r"observations .* from seed 4 at step 0, index \(0, 1\)"
+    ):
         batch.learn(5)
 
 
@@ -112,7 +112,7 @@ def test_the_environment_of_several_is_named() -> None:
 def test_dictionaries_are_looked_through() -> None:
     env = Faulty("observations", np.inf, dictionary=True)
     model = SACFlow("MultiInputGaussPolicy", env, **SEEDED)
-    message = r"observations\['camera'\] must be .* got inf from environment 0, element 1, at"
+    message = r"observations\['camera'\] must be .* got inf from environment 0 at step 20"
     with pytest.raises(NonFiniteError, match=message):
         model.learn(50)
 
@@ -205,14 +205,12 @@ def test_training_stops_and_goes_back(
         loss = "critic_loss"
     with pytest.raises(NonFiniteError, match=rf"{loss} must be finite, got .*step 60") as caught:
         model.train(3, batch_size=16)
-    error = caught.value
-    assert error.tensor == loss
-    assert error.restored == updates == model._n_updates
-    assert f"back at update {updates}" in str(error)
+    error = str(caught.value)
+    assert model._n_updates == updates
+    assert f"back at update {updates}" in error
     assert_equal(state(model), before)
-    spoilt = error.batch[column]
-    assert spoilt["not_finite"] if not np.isfinite(value) else spoilt["high"] > 1e29
-    assert f"{column} " in str(error)
+    look_at = "values not finite, the first in row" if not np.isfinite(value) else "extreme in row"
+    assert re.search(f"{column} [^;]*{look_at}", error)
     # The model is of use again once the data are.
     spoil(model, column, slice(None), 0.5)  # type: ignore[arg-type]
     model.train(3, batch_size=16)
@@ -244,18 +242,14 @@ def test_the_update_and_the_row_are_named() -> None:
     assert update > 0
     np.random.seed(5)  # noqa: NPY002
     first = model._n_updates
-    with pytest.raises(
-        NonFiniteError, match=f"in update {first + update + 1}; minibatch"
-    ) as caught:
+    count = (drawn[update] == 33).sum()
+    message = (
+        f"in update {first + update + 1}; minibatch: observations [^;]*; actions [^;]*; rewards "
+        f"[^;]* and {count} values not finite, the first in row {row}; next_observations"
+    )
+    with pytest.raises(NonFiniteError, match=message) as caught:
         model.train(40, batch_size=16)
-    assert caught.value.update == first + update + 1
-    assert caught.value.batch["rewards"] == {
-        "low": pytest.approx(caught.value.batch["rewards"]["low"]),
-        "high": pytest.approx(caught.value.batch["rewards"]["high"]),
-        "not_finite": (drawn[update] == 33).sum(),
-        "row": row,
-    }
-    assert caught.value.batch["observations"]["not_finite"] == 0
+    assert str(caught.value).count("not finite") == 1
 
 
 @pytest.mark.parametrize("where", ["parameter", "moment", "temperature"])
@@ -303,22 +297,14 @@ def test_seed_batch_names_the_agent_and_takes_all_back() -> None:
     batch = SeedBatch("FlowPolicy", "Pendulum-v1", [3, 9, 7], compile=False, **FAST).learn(40)
     before = [state(model) for model in batch.models]
     spoil(batch.models[1], "rewards", slice(0, 40), np.nan)  # type: ignore[arg-type]
-    with pytest.raises(NonFiniteError, match=r"critic_loss .* \(seed 9, step 4\d\)") as caught:
+    message = r"critic_loss .* \(seed 9, step 4\d\) in update 3[12]; .* back at update 30\."
+    with pytest.raises(NonFiniteError, match=message):
         batch.learn(30, reset_num_timesteps=False)
-    assert (caught.value.seed, caught.value.restored) == (9, 30)
-    assert caught.value.update in (31, 32)
     for model, expected in zip(batch.models, before, strict=True):
         assert_equal(state(model), expected)
         assert model._n_updates == 30
     spoil(batch.models[1], "rewards", slice(None), 0.0)  # type: ignore[arg-type]
     batch.learn(5, reset_num_timesteps=False)
-
-
-def test_errors_travel_between_processes() -> None:
-    error = NonFiniteError("why", "rewards", np.inf, step=3, seed=4, batch={"rewards": {"row": 1}})
-    copy = pickle.loads(pickle.dumps(error))
-    assert str(copy) == "why"
-    assert vars(copy) == vars(error)
 
 
 @pytest.mark.parametrize(
