@@ -22,7 +22,7 @@ from sb3_flowpolicy.algorithms.demonstrations import (
     load_demonstrations,
 )
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
-from sb3_flowpolicy.bundle import Normalization, load_bundle, save_bundle
+from sb3_flowpolicy.bundle import load_bundle, save_bundle
 from sb3_flowpolicy.common.validation import check_settings, integer, number, optional
 from sb3_flowpolicy.engine.sac import SB3_CRITIC_LOSS_COEF, SACObjective
 from sb3_flowpolicy.policies import sac
@@ -89,7 +89,7 @@ class SACFlow(EngineFlow, SAC):
     }
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = sac.ALIASES
     #: Statistics of ``VecNormalize`` from a bundle that was loaded without an environment.
-    normalization: Normalization | None = None
+    normalization: VecNormalize | None = None
 
     def __init__(
         self,

@@ -2,6 +2,5 @@
 
 from sb3_flowpolicy.bundle.container import BundleError
 from sb3_flowpolicy.bundle.model import load_bundle, save_bundle
-from sb3_flowpolicy.bundle.normalization import Normalization
 
-__all__ = ["BundleError", "Normalization", "load_bundle", "save_bundle"]
+__all__ = ["BundleError", "load_bundle", "save_bundle"]

@@ -8,19 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import stable_baselines3
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.utils import check_for_correct_spaces, get_device
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    VecEnv,
-    VecNormalize,
-    unwrap_vec_normalize,
-)
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 import sb3_flowpolicy
 from sb3_flowpolicy.bundle import training
@@ -33,12 +27,19 @@ from sb3_flowpolicy.bundle.container import (
     write_container,
 )
 from sb3_flowpolicy.bundle.normalization import (
-    Normalization,
     normalization_from_spec,
     normalization_of,
     normalization_to_spec,
+    wrap_env,
 )
-from sb3_flowpolicy.bundle.policy import expected_parameters, policy_from_spec, policy_to_spec
+from sb3_flowpolicy.bundle.policy import (
+    class_of,
+    expected_parameters,
+    name_of,
+    plain,
+    policy_from_spec,
+    policy_to_spec,
+)
 from sb3_flowpolicy.bundle.spaces import space_from_spec, space_to_spec
 from sb3_flowpolicy.common.validation import Check, integer, number
 
@@ -120,7 +121,7 @@ def made_with() -> dict[str, str]:
     }
 
 
-def _describe(model: Any, normalization: Normalization | None) -> tuple[dict[str, Any], Arrays]:
+def _describe(model: Any, normalization: VecNormalize | None) -> tuple[dict[str, Any], Arrays]:
     """Return the configuration and the arrays that say everything about a model."""
     arrays: Arrays = {
         f"policy.{name}": value.detach().cpu().numpy()
@@ -138,7 +139,10 @@ def _describe(model: Any, normalization: Normalization | None) -> tuple[dict[str
                 for name, check in model.settings.items()
             },
         },
-        "replay_buffer": training.buffer_to_spec(model),
+        "replay_buffer": {
+            "class": name_of("replay_buffer_class", model.replay_buffer_class),
+            "kwargs": plain("replay_buffer_kwargs", model.replay_buffer_kwargs),
+        },
         "progress": {name: check(name, getattr(model, name)) for name, check in _PROGRESS.items()},
         "optimizers": {
             name: training.optimizer_to_spec(f"optimizer.{name}", optimizer, arrays)
@@ -160,14 +164,18 @@ def _parse(
     """Return a model's attributes and its policy's parameters, validated before building it."""
     if config["format"] != FORMAT:
         raise ValueError(f"format must be {FORMAT}, got {config['format']}: is it a newer file?")
-    space = space_from_spec("observation_space", config["observation_space"], arrays)
+    spaces = {
+        name: space_from_spec(name, config[name], arrays)
+        for name in ("observation_space", "action_space")
+    }
+    buffer = config["replay_buffer"]
     attributes = {
-        "observation_space": space,
-        "action_space": space_from_spec("action_space", config["action_space"], arrays),
+        **spaces,
         "learning_rate": training.rate_from_spec(config["settings"]["learning_rate"]),
-        "normalization": normalization_from_spec(config["normalization"], space, arrays),
+        "normalization": normalization_from_spec(config["normalization"], **spaces, arrays=arrays),
+        "replay_buffer_class": class_of("replay_buffer_class", buffer["class"]),
+        "replay_buffer_kwargs": dict(buffer["kwargs"]),
         **policy_from_spec(config["policy"]),
-        **training.buffer_from_spec(config["replay_buffer"]),
     }
     for name, check in cls.settings.items():
         value = config["settings"][name]
@@ -209,21 +217,15 @@ def _refusing(path: Path) -> Iterator[None]:
 
 def _wrapped(cls: type[SAC], env: Any, attributes: dict[str, Any]) -> VecEnv:
     """Wrap the environment with the statistics that the model was trained with."""
-    env = gym.make(env) if isinstance(env, str) else env
     normalization = attributes["normalization"]
-    if normalization is not None:
-        if isinstance(env, VecEnv) and unwrap_vec_normalize(env) is not None:
-            raise ValueError(
-                "env must come without VecNormalize: load_safe wraps it with the statistics of the "
-                "bundle"
-            )
-        if not isinstance(env, VecEnv):
-            single = Monitor(env)
-            env = DummyVecEnv([lambda: single])
-        env = normalization.wrap(env)
-    env = cls._wrap_env(env)
-    check_for_correct_spaces(env, attributes["observation_space"], attributes["action_space"])
-    return env
+    if normalization is not None and isinstance(env, VecEnv) and unwrap_vec_normalize(env):
+        raise ValueError(
+            "env must come without VecNormalize: load_safe wraps it with the statistics of the "
+            "bundle"
+        )
+    venv = cls._wrap_env(maybe_make_env(env, 0))
+    check_for_correct_spaces(venv, attributes["observation_space"], attributes["action_space"])
+    return venv if normalization is None else wrap_env(normalization, venv)
 
 
 def _ent_coef(model: SAC) -> tuple[str, th.Tensor]:

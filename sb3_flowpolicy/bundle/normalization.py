@@ -1,32 +1,25 @@
-"""The statistics of ``VecNormalize``, separate from environments."""
+"""``VecNormalize`` without environments: statistics to read, to share, and to wrap others with."""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_flowpolicy.bundle.container import Arrays
-from sb3_flowpolicy.common.validation import Check, flag, number
+from sb3_flowpolicy.common.validation import Check, flag, number, or_infinity
 
 _above_zero = number(0, above=True)
-
-
-def _bound(name: str, value: Any) -> float:
-    """Accept infinity, too, which JSON spells "inf"."""
-    return math.inf if value in ("inf", math.inf) else _above_zero(name, value)
-
-
 _SETTINGS: dict[str, Check] = {
     **dict.fromkeys(("training", "norm_obs", "norm_reward"), flag),
-    **dict.fromkeys(("clip_obs", "clip_reward"), _bound),
+    **dict.fromkeys(("clip_obs", "clip_reward"), or_infinity(_above_zero)),
     "gamma": number(0, 1),
     "epsilon": _above_zero,
 }
@@ -34,96 +27,81 @@ _SETTINGS: dict[str, Check] = {
 ONLY_KEY = ""
 
 
-@dataclass(frozen=True)
-class Normalization:
-    """Running statistics, and how to apply them.
+class _Spaces(gym.Env):
+    """An environment that has spaces and nothing else."""
 
-    Args:
-        settings: ``VecNormalize``'s arguments.
-        statistics: Mean, variance and count per observation key that is normalized; the key is
-            ``""`` if observations are arrays.
-        returns: The same of the discounted return.
-    """
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
 
-    settings: Mapping[str, Any]
-    statistics: Mapping[str, RunningMeanStd]
-    returns: RunningMeanStd
 
-    @classmethod
-    def of(cls, env: VecNormalize) -> Normalization:
-        """Copy the present statistics of ``env``."""
-        settings = {key: check(key, getattr(env, key)) for key, check in _SETTINGS.items()}
-        found: Any = env.obs_rms if env.norm_obs else {}
-        found = found if isinstance(found, dict) else {ONLY_KEY: found}
-        return cls(settings, {key: rms.copy() for key, rms in found.items()}, env.ret_rms.copy())
+class _Statistics(VecNormalize):
+    """Statistics of no environment, which can be pickled more than once."""
 
-    def normalize_obs(self, obs: Any) -> Any:
-        """Normalize observations as ``VecNormalize`` does, an array or a dict of arrays."""
-        if isinstance(obs, Mapping):
-            known = self.statistics
-            return {k: self._one(v, known[k]) if k in known else v for k, v in obs.items()}
-        return self._one(obs, self.statistics[ONLY_KEY]) if self.statistics else obs
-
-    def _one(self, obs: Any, rms: RunningMeanStd) -> np.ndarray:
-        scaled = (np.asarray(obs) - rms.mean) / np.sqrt(rms.var + self.settings["epsilon"])
-        clip = self.settings["clip_obs"]
-        return np.clip(scaled, -clip, clip).astype(np.float32)
-
-    def wrap(self, env: VecEnv) -> VecNormalize:
-        """Wrap environments with these statistics."""
-        keys = [key for key in self.statistics if key != ONLY_KEY]
-        if not set(keys) <= set(parts_of(env.observation_space)):
-            raise ValueError(f"env must have the observations {keys}, got {env.observation_space}")
-        wrapped = VecNormalize(env, **self.settings, norm_obs_keys=keys or None)
-        copies = {key: rms.copy() for key, rms in self.statistics.items()}
-        if copies:
-            wrapped.obs_rms = copies.get(ONLY_KEY, copies)  # type: ignore[assignment]
-        wrapped.ret_rms = self.returns.copy()
-        return wrapped
+    def __getstate__(self) -> dict[str, Any]:
+        bound = ("venv", "class_attributes", "returns")
+        return {name: value for name, value in vars(self).items() if name not in bound}
 
 
 def normalization_of(
     model: OffPolicyAlgorithm, vec_normalize: VecNormalize | None = None
-) -> Normalization | None:
+) -> VecNormalize | None:
     """Return the given statistics, those of a model's environment, those of its bundle, or None."""
     live = vec_normalize if vec_normalize is not None else model.get_vec_normalize_env()
-    return Normalization.of(live) if live is not None else getattr(model, "normalization", None)
+    return live if live is not None else getattr(model, "normalization", None)
 
 
-def normalization_to_spec(known: Normalization | None, arrays: Arrays) -> dict[str, Any] | None:
+def wrap_env(known: VecNormalize, env: VecEnv) -> VecNormalize:
+    """Wrap environments with a copy of statistics."""
+    settings = {name: getattr(known, name) for name in (*_SETTINGS, "norm_obs_keys")}
+    wrapped = VecNormalize(env, **settings)
+    if known.norm_obs:
+        wrapped.obs_rms = copy.deepcopy(known.obs_rms)
+    wrapped.ret_rms = known.ret_rms.copy()
+    return wrapped
+
+
+def obs_statistics(known: VecNormalize | None) -> dict[str, RunningMeanStd]:
+    """Return the statistics by observation key; the key is "" if observations are arrays."""
+    found: Any = known.obs_rms if known is not None and known.norm_obs else {}
+    return found if isinstance(found, dict) else {ONLY_KEY: found}
+
+
+def normalization_to_spec(known: VecNormalize | None, arrays: Arrays) -> dict[str, Any] | None:
     """Describe statistics, and put them into ``arrays``."""
     if known is None:
         return None
-    for index, rms in enumerate([*known.statistics.values(), known.returns]):
+    statistics = obs_statistics(known)
+    for index, rms in enumerate([*statistics.values(), known.ret_rms]):
         for moment in ("mean", "var", "count"):
             value = np.asarray(getattr(rms, moment), np.float64)
             arrays[f"normalization.{index}.{moment}"] = value
-    settings = {key: "inf" if value == math.inf else value for key, value in known.settings.items()}
-    return {**settings, "keys": list(known.statistics)}
+    settings = {name: check(name, getattr(known, name)) for name, check in _SETTINGS.items()}
+    # JSON has no infinity.
+    plain = {name: "inf" if value == math.inf else value for name, value in settings.items()}
+    return {**plain, "keys": list(statistics)}
 
 
-def normalization_from_spec(spec: Any, space: spaces.Space, arrays: Arrays) -> Normalization | None:
+def normalization_from_spec(
+    spec: Any, observation_space: spaces.Space, action_space: spaces.Space, arrays: Arrays
+) -> VecNormalize | None:
     """Build the statistics that :func:`normalization_to_spec` described, if any."""
     if spec is None:
         return None
-    settings = {key: check(f"normalization.{key}", spec[key]) for key, check in _SETTINGS.items()}
-    parts, keys = parts_of(space), spec["keys"]
-    if not set(keys) <= set(parts) or bool(keys) != settings["norm_obs"]:
-        raise ValueError(f"normalization.keys must be among {list(parts)}, got {keys}")
-    shapes = [parts[key].shape or () for key in keys]
-    found = [_statistics(index, shape, arrays) for index, shape in enumerate([*shapes, ()])]
-    return Normalization(settings, dict(zip(keys, found, strict=False)), found[-1])
-
-
-def _statistics(index: int, shape: tuple[int, ...], arrays: Arrays) -> RunningMeanStd:
-    rms = RunningMeanStd()
-    for moment, expected in (("mean", shape), ("var", shape), ("count", ())):
-        name = f"normalization.{index}.{moment}"
-        value = arrays[name]
-        if value.shape != expected or (moment != "mean" and not (value >= 0).all()):
-            raise ValueError(f"{name} must be at least 0, of shape {expected}, got {value.shape}")
-        setattr(rms, moment, float(value) if moment == "count" else value)
-    return rms
+    given = {name: math.inf if spec[name] == "inf" else spec[name] for name in _SETTINGS}
+    settings = {
+        name: check(f"normalization.{name}", given[name]) for name, check in _SETTINGS.items()
+    }
+    nowhere = DummyVecEnv([lambda: _Spaces(observation_space, action_space)])
+    keys = [key for key in spec["keys"] if key != ONLY_KEY]
+    found = _Statistics(nowhere, **settings, norm_obs_keys=keys or None)
+    for index, rms in enumerate([*obs_statistics(found).values(), found.ret_rms]):
+        for moment in ("mean", "var", "count"):
+            name = f"normalization.{index}.{moment}"
+            value, shape = arrays[name], np.shape(getattr(rms, moment))
+            if value.shape != shape or (moment != "mean" and not (value >= 0).all()):
+                raise ValueError(f"{name} must be at least 0, of shape {shape}, got {value.shape}")
+            setattr(rms, moment, float(value) if moment == "count" else value)
+    return found
 
 
 def parts_of(space: spaces.Space) -> dict[str, spaces.Space]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from enum import Enum
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_flowpolicy import policies
-from sb3_flowpolicy.common.validation import integer, one_of
+from sb3_flowpolicy.common.validation import one_of
 
 
 def _by_name(*classes: type) -> dict[str, Any]:
@@ -41,8 +41,6 @@ _CLASSES = {
         ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer
     ),
 }
-# More would take gigabytes at the first prediction.
-_samples = integer(2, 2**16)
 
 
 def name_of(argument: str, value: Any) -> str:
@@ -79,8 +77,6 @@ def policy_from_spec(spec: Mapping[str, Any]) -> dict[str, Any]:
     if kwargs.get("use_sde"):
         # Its noise is drawn while the policy is built, which the meta device cannot do.
         raise ValueError("use_sde must be False for a safe bundle, got True: use model.save()")
-    if "deterministic_samples" in kwargs:
-        _samples("deterministic_samples", kwargs["deterministic_samples"])
     return {"policy_class": kwargs.pop("policy_class"), "policy_kwargs": kwargs}
 
 
@@ -89,30 +85,23 @@ def expected_parameters(attributes: Mapping[str, Any], n_arrays: int) -> dict[st
 
     The construction takes time, so it stops at more parameters than there are arrays.
     """
-    policy_class = attributes["policy_class"]
+    policy_class, count = attributes["policy_class"], itertools.count(1)
+    thread = threading.get_ident()
+
+    def limit(*_: Any) -> None:
+        if threading.get_ident() == thread and next(count) > n_arrays:
+            raise ValueError(f"policy must have no more parameters than the {n_arrays} arrays")
+
     # SB3 moves the actor to the policy's device, which without real parameters is the CPU.
     without_memory = type(policy_class.__name__, (policy_class,), {"device": th.device("meta")})
     spaces = attributes["observation_space"], attributes["action_space"]
-    with th.device("meta"), _at_most_parameters(n_arrays):
-        return without_memory(*spaces, lambda _: 0.0, **attributes["policy_kwargs"]).state_dict()
-
-
-@contextmanager
-def _at_most_parameters(most: int) -> Iterator[None]:
-    """Raise ``ValueError`` as soon as this thread builds more parameters."""
-    count, thread = 0, threading.get_ident()
-
-    def tally(*_: Any) -> None:
-        nonlocal count
-        count += threading.get_ident() == thread
-        if count > most:
-            raise ValueError(f"policy must have no more parameters than the {most} arrays")
-
-    handle = register_module_parameter_registration_hook(tally)
+    handle = register_module_parameter_registration_hook(limit)
     try:
-        yield
+        with th.device("meta"):
+            policy = without_memory(*spaces, lambda _: 0.0, **attributes["policy_kwargs"])
     finally:
         handle.remove()
+    return policy.state_dict()
 
 
 def plain(name: str, value: Any) -> Any:

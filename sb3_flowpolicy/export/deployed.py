@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_flowpolicy.bundle.normalization import ONLY_KEY, Normalization, parts_of
+from sb3_flowpolicy.bundle.normalization import ONLY_KEY, obs_statistics, parts_of
 from sb3_flowpolicy.policies import DistributionPolicy, FlowActor
 
 
@@ -24,7 +25,7 @@ class DeployedPolicy(nn.Module):
     """
 
     def __init__(
-        self, policy: DistributionPolicy, normalization: Normalization | None, stochastic: bool
+        self, policy: DistributionPolicy, normalization: VecNormalize | None, stochastic: bool
     ) -> None:
         super().__init__()
         # A copy, as it is moved to the CPU and set to evaluation mode.
@@ -36,16 +37,13 @@ class DeployedPolicy(nn.Module):
         low, high = space.low.reshape(-1), space.high.reshape(-1)
         self.register_buffer("low", th.from_numpy(low.copy()))
         self.register_buffer("span", th.from_numpy(high - low))
-        self.clip = 0.0 if normalization is None else normalization.settings["clip_obs"]
-        self.normalized: list[str] = []
-        for index, key in enumerate(self.keys):
-            if normalization is not None and key in normalization.statistics:
-                rms = normalization.statistics[key]
-                std = np.sqrt(rms.var + normalization.settings["epsilon"])
-                # float64 as in VecNormalize: float32 would lose digits to a large mean.
-                self.register_buffer(f"mean_{index}", th.from_numpy(np.array(rms.mean)))
-                self.register_buffer(f"std_{index}", th.from_numpy(np.array(std)))
-                self.normalized.append(key)
+        self.clip = 0.0 if normalization is None else normalization.clip_obs
+        self.moments: dict[str, tuple[th.Tensor, th.Tensor]] = {}
+        for key, rms in obs_statistics(normalization).items():
+            assert normalization is not None
+            std = np.sqrt(rms.var + normalization.epsilon)
+            # float64 as in VecNormalize: float32 would lose digits to a large mean.
+            self.moments[key] = th.tensor(rms.mean), th.tensor(std)
         #: Names of the inputs and outputs of the graph, in order.
         self.inputs = [key or "obs" for key in self.keys] + ["noise"] * stochastic
         self.outputs = ["action"] + ["sampled_action"] * stochastic
@@ -55,7 +53,10 @@ class DeployedPolicy(nn.Module):
 
         ``inputs`` are an observation (batch, ...) per key and, if stochastic, noise (batch, M).
         """
-        obs: Any = {key: self._normalize(i, inputs[i]) for i, key in enumerate(self.keys)}
+        obs: Any = dict(zip(self.keys, inputs, strict=False))
+        for key, (mean, std) in self.moments.items():
+            scaled = ((obs[key].double() - mean) / std).clamp(-self.clip, self.clip)
+            obs[key] = scaled.float()
         context = self.actor.context(obs.get(ONLY_KEY, obs))
         actions = [self.actor.density.mode(context)]
         if self.stochastic:
@@ -65,12 +66,6 @@ class DeployedPolicy(nn.Module):
             (low + 0.5 * (action + 1.0) * span).unflatten(-1, self.action_shape)
             for action in actions
         )
-
-    def _normalize(self, index: int, obs: th.Tensor) -> th.Tensor:
-        if self.keys[index] not in self.normalized:
-            return obs
-        mean, std = self.get_buffer(f"mean_{index}"), self.get_buffer(f"std_{index}")
-        return ((obs.double() - mean) / std).clamp(-self.clip, self.clip).float()
 
 
 def random_inputs(
@@ -88,7 +83,7 @@ def random_inputs(
 
 def expected_actions(
     policy: DistributionPolicy,
-    normalization: Normalization | None,
+    normalization: VecNormalize | None,
     stochastic: bool,
     inputs: Sequence[np.ndarray],
 ) -> list[np.ndarray]:

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import safetensors.numpy
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import SACFlow
+from sb3_flowpolicy.benchmarks.her import Reach
 from sb3_flowpolicy.bundle.container import (
     canonical,
     checksum,
@@ -38,7 +39,7 @@ UNUSUAL: dict[str, dict[str, Any]] = {
 
 
 def multi_env() -> Any:
-    return BitFlippingEnv(n_bits=3, continuous=True)
+    return gym.wrappers.TimeLimit(Reach(), 5)
 
 
 def make_model(policy: str = "FlowPolicy", env: Any = "Pendulum-v1", **kwargs: Any) -> SACFlow:

@@ -165,6 +165,11 @@ def test_statistics_are_those_of_the_environment(tmp_path: Path) -> None:
     assert (wrapped.norm_reward, wrapped.ret_rms.count) == (False, env.ret_rms.count)
     with pytest.raises(ValueError, match="env must come without VecNormalize"):
         SACFlow.load_safe(again, env=behind_statistics())
+    # Zips of the model have them, too.
+    for _ in range(2):
+        loaded.save(tmp_path / "zip")
+        loaded = SACFlow.load(tmp_path / "zip")
+        np.testing.assert_array_equal(loaded.normalization.normalize_obs(obs), expected)
 
 
 def test_statistics_of_dictionaries_name_their_keys(tmp_path: Path) -> None:
