@@ -42,17 +42,20 @@ def at_least(least: int) -> Callable[[str], int]:
     return convert
 
 
-def assignment(text: str) -> tuple[str, Any]:
+def assignment(text: str, sign: str = "=") -> tuple[str, Any]:
     """Type for argparse: ``NAME=VALUE`` with a YAML value.
 
     Example:
         >>> assignment("width=0.1")
         ('width', 0.1)
     """
-    name, sign, value = text.partition("=")
-    if not name or not sign:
-        raise argparse.ArgumentTypeError(f"must be NAME=VALUE, got {text!r}")
-    return name, yaml.safe_load(value)
+    name, found, value = text.partition(sign)
+    try:
+        if name and found:
+            return name, yaml.safe_load(value)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError):
+        pass  # the value is no YAML
+    raise argparse.ArgumentTypeError(f"must be NAME{sign}VALUE, got {text[:80]!r}")
 
 
 def check_folder_of(parser: argparse.ArgumentParser, option: str, path: Path | None) -> None:
@@ -65,5 +68,6 @@ def run(main: Callable[[], Any]) -> None:
     """Run a command; say in one line what went wrong, without a traceback."""
     try:
         main()
-    except (ValueError, AssertionError, OSError, gym.error.Error) as error:  # rl_zoo3 asserts
+    # rl_zoo3 asserts.
+    except (ValueError, AssertionError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"error: {error}")

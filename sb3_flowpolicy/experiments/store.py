@@ -38,7 +38,7 @@ BASIC_COLUMNS = (
     *("test_success", "entropy", "ent_coef"),
 )
 
-# What the files hold, see common.files.require.
+# What the files hold, see common.files.read_json.
 _SETTINGS_FIELDS = {"schema": int, "experiment": str, "steps": int, "seeds": list, "items": dict}
 _DONE_FIELDS = {
     **{"key": str, "steps": int, "seeds": list, "table": int, "details": int, "sha256": str},

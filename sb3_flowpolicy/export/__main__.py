@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import argparse
 import pickle
-import sys
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.bundle.model import SUFFIX
+from sb3_flowpolicy.common.command_line import run
 from sb3_flowpolicy.export.onnx_export import export_onnx
 
 _EXAMPLES = """\
@@ -51,24 +49,16 @@ def main(arguments: list[str] | None = None) -> None:
     )
     add("--stochastic", action="store_true", help="onnx: also sample (a bundle always can)")
     args = parser.parse_args(arguments)
-    try:
-        model = _load_model(args.model)
-        statistics = args.vecnormalize
-        # A bundle contains its statistics, so no pickle next to it is opened.
-        if statistics is None and zipfile.is_zipfile(args.model):
-            statistics = find_statistics(args.model)
-        vec_normalize = None if statistics is None else _load_statistics(statistics)
-        output = args.output or args.model.with_suffix(_SUFFIXES[args.format])
-        if args.format == "safe":
-            path = model.save_safe(output, vec_normalize)
-        else:
-            path = export_onnx(
-                model, output, stochastic=args.stochastic, vec_normalize=vec_normalize
-            )
-    except (ValueError, OSError) as error:
-        parser.exit(2, f"{parser.prog}: {error}\n")
-    except ModuleNotFoundError as error:
-        parser.exit(2, f'{parser.prog}: {error}; install it with "sb3_flowpolicy[export]"\n')
+    model, statistics = _load_model(args.model), args.vecnormalize
+    # A bundle contains its statistics, so no pickle next to it is opened.
+    if statistics is None and zipfile.is_zipfile(args.model):
+        statistics = find_statistics(args.model)
+    vec_normalize = None if statistics is None else _load_statistics(statistics)
+    output = args.output or args.model.with_suffix(_SUFFIXES[args.format])
+    if args.format == "safe":
+        path = model.save_safe(output, vec_normalize)
+    else:
+        path = export_onnx(model, output, stochastic=args.stochastic, vec_normalize=vec_normalize)
     included = f" with the statistics of {statistics}" if statistics is not None else ""
     print(f"{path}: {path.stat().st_size / 1024:.0f} KiB{included}")
 
@@ -99,29 +89,18 @@ def _load_model(path: Path) -> SACFlow:
     if not zipfile.is_zipfile(path):
         return SACFlow.load_safe(path, device="cpu")
     no_buffer: Any = object()
-    with _explaining(f"{path} must be a model that SACFlow or SAC saved"):
-        # Keeps SB3 from building a buffer, which HER cannot do without an environment.
-        model = SACFlow.load(path, device="cpu", replay_buffer=no_buffer)
+    # Keeps SB3 from building a buffer, which HER cannot do without an environment.
+    model = SACFlow.load(path, device="cpu", replay_buffer=no_buffer)
     model.replay_buffer = None
     return model
 
 
 def _load_statistics(path: Path) -> VecNormalize:
-    with path.open("rb") as file, _explaining(f"{path} must be what VecNormalize.save wrote"):
-        found = pickle.load(file)
-        if not isinstance(found, VecNormalize):
-            raise TypeError(f"it is a {type(found).__name__}")
+    found = pickle.loads(path.read_bytes())
+    if not isinstance(found, VecNormalize):
+        raise ValueError(f"{path} must be what VecNormalize.save wrote, got {type(found).__name__}")
     return found
 
 
-@contextmanager
-def _explaining(expectation: str) -> Iterator[None]:
-    """Turn all exceptions into ``ValueError``: pickles can raise any."""
-    try:
-        yield
-    except Exception as error:
-        raise ValueError(f"{expectation}, got {type(error).__name__}: {error}") from error
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run(main)

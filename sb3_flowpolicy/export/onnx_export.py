@@ -173,17 +173,13 @@ def describe_space(space: spaces.Space) -> dict[str, Any]:
         "dtype": str(space.dtype),
         "shape": list(space.shape or ()),
     }
-    if isinstance(space, spaces.Box):
-        facts.update(low=_bounds(space.low), high=_bounds(space.high))
-    sizes = {"n", "nvec"} & vars(space).keys()
-    return {**facts, **{name: np.asarray(getattr(space, name)).tolist() for name in sizes}}
-
-
-def _bounds(bounds: np.ndarray) -> Any:
-    same = bounds.size > 0 and (bounds == bounds.flat[0]).all()
-    # JSON has no infinity.
-    words = np.where(np.isfinite(bounds), bounds.astype(object), bounds.astype(str))
-    return words.flat[0] if same else words.tolist()
+    for name in ("low", "high", "n", "nvec"):
+        if name in vars(space):
+            values = np.asarray(getattr(space, name))
+            # JSON has no infinity.
+            words = np.where(np.isfinite(values), values.astype(object), values.astype(str))
+            facts[name] = words.flat[0] if np.unique(values).size == 1 else words.tolist()
+    return facts
 
 
 def _check(

@@ -11,6 +11,7 @@ import pytest
 from stable_baselines3 import SAC, HerReplayBuffer
 
 from sb3_flowpolicy import GaussPolicy, SACFlow
+from sb3_flowpolicy.common.command_line import run
 from sb3_flowpolicy.export.__main__ import find_statistics, main
 from tests.bundle.conftest import FAST, NET, behind_statistics, make_model, multi_env
 
@@ -84,41 +85,30 @@ def test_where_statistics_are_looked_for(tmp_path: Path) -> None:
             "nowhere.zip must be a bundle written by save_safe: not a regular file that exists",
         ),
         (["safe", "text.zip"], "text.zip must be a bundle written by save_safe: a header of"),
-        (["onnx", "empty.zip"], "empty.zip must be a model that SACFlow or SAC saved, got "),
         (["onnx", "stock.zip"], "model must have a policy of sb3_flowpolicy"),
         (["safe", "stock.zip"], "policy_class must be one of"),
         (["safe", "model.zip", "--vecnormalize", "x"], "No such file or directory: 'x'"),
         (
-            ["safe", "model.zip", "--vecnormalize", "text.zip"],
-            "must be what VecNormalize.save wrote",
-        ),
-        (
             ["safe", "model.zip", "--vecnormalize", "list.pkl"],
-            "got TypeError: it is a list",
+            "list.pkl must be what VecNormalize.save wrote, got list",
         ),
     ],
 )
-def test_errors_are_one_line_and_exit_with_two(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_errors_are_one_line(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("text.zip").write_text("this is no zip, and no bundle either")
     Path("list.pkl").write_bytes(pickle.dumps([]))
-    Path("empty.zip").write_bytes(b"PK\x05\x06" + bytes(18))
     if "model.zip" in arguments:
         make_model().save("model.zip")
     if "stock.zip" in arguments:
         SAC("MlpPolicy", "Pendulum-v1", **FAST).save("stock.zip")
     with pytest.raises(SystemExit) as end:
-        main(arguments)
-    error = capsys.readouterr().err
-    assert end.value.code == 2
+        run(lambda: main(arguments))
+    error = str(end.value.code)
     assert message in error
-    assert error.count("\n") == 1
+    assert "\n" not in error
     assert not list(tmp_path.glob("*.safetensors"))
 
 

@@ -5,8 +5,6 @@ import sys
 
 import pytest
 
-from sb3_flowpolicy.zoo import launcher
-
 SCRIPTS = pytest.mark.parametrize("script", ["train", "enjoy", "record_video"])
 
 
@@ -22,13 +20,6 @@ def launch(monkeypatch):
         runpy.run_module(module, run_name="__main__")
 
     return run
-
-
-@SCRIPTS
-def test_without_rl_zoo3_it_says_what_to_install(script, launch, monkeypatch):
-    monkeypatch.setattr(launcher, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit, match=r'pip install "sb3_flowpolicy\[zoo\]"'):
-        launch(script)
 
 
 @SCRIPTS
