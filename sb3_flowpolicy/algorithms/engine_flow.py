@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flowpolicy.algorithms import exploration
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
-from sb3_flowpolicy.checkpoint.segments import Ring
+from sb3_flowpolicy.checkpoint.rows import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import (
@@ -169,10 +169,10 @@ class EngineFlow(OffPolicyAlgorithm):
             ValueError: If the folder holds no undamaged checkpoint, or one of another algorithm, or
                 the environment does not fit.
         """
-        store, checkpoint = open_checkpoint(path, cls.__name__)
+        checkpoint = open_checkpoint(path, cls.__name__)
         venv = cls._wrap_env(maybe_make_env(env, 0))
         model = load_agent(cls, checkpoint, "model", venv, device)
-        model._checkpoints.load(store, checkpoint)
+        model._checkpoints.load(checkpoint)
         return model
 
     def learn(

@@ -56,7 +56,7 @@ class RunCheckpointCallback(BaseCallback):
 
 def _resume_in_place(model: Any, checkpoints: RunCheckpoints, path: str | Path) -> None:
     """Turn a new model into the agent of the newest checkpoint, while learning is being set up."""
-    store, checkpoint = open_checkpoint(path, type(model).__name__)
+    checkpoint = open_checkpoint(path, type(model).__name__)
     check_same_build(model.env, checkpoint.manifest["layers"]["model"])
     archive = checkpoint.folder / "model.zip"
     _, parameters, variables = load_from_zip_file(archive, device=model.device)
@@ -69,6 +69,6 @@ def _resume_in_place(model: Any, checkpoints: RunCheckpoints, path: str | Path) 
         raise ValueError(
             f"model must be built with the settings of the run in {path}: {error}"
         ) from error
-    checkpoints.load(store, checkpoint)
+    checkpoints.load(checkpoint)
     if model._last_obs is None:
         model._last_obs = model.env.reset()

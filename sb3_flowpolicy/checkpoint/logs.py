@@ -19,13 +19,12 @@ from sb3_flowpolicy.checkpoint.pickling import is_data
 
 def log_files(logger: Logger) -> dict[str, IO[str]]:
     """Return the files that a logger writes text to, by format."""
-    files: dict[str, IO[str]] = {}
-    for one in logger.output_formats:
-        if isinstance(one, CSVOutputFormat | JSONOutputFormat):
-            files[type(one).__name__] = one.file
-        if isinstance(one, HumanOutputFormat) and one.own_file:
-            files[type(one).__name__] = one.file
-    return files
+    kinds = CSVOutputFormat | JSONOutputFormat | HumanOutputFormat
+    return {
+        type(one).__name__: one.file
+        for one in logger.output_formats
+        if isinstance(one, kinds) and getattr(one, "own_file", True)
+    }
 
 
 def read_texts(files: Mapping[str, IO[str]]) -> dict[str, str]:

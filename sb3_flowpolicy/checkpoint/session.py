@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_flowpolicy.checkpoint import segments, state
+from sb3_flowpolicy.checkpoint import state
 from sb3_flowpolicy.checkpoint.environments import check_same_build, layers
-from sb3_flowpolicy.checkpoint.segments import RowFiles, Segment
+from sb3_flowpolicy.checkpoint.rows import RowFiles, fill
 from sb3_flowpolicy.checkpoint.signals import StopSignals
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.checkpoint.store import Checkpoint, CheckpointStore
@@ -49,7 +49,6 @@ class RunCheckpoints:
         # begun, and the step at which the interrupted call of ``learn`` began.
         self._late: bytes | None = None
         self._begun = 0
-        self._resumed_from: CheckpointStore | None = None
         #: Environments whose state could not be saved: they begin new episodes when resumed.
         self.opaque: set[str] = set()
 
@@ -100,19 +99,14 @@ class RunCheckpoints:
 
         The first checkpoint of a new run is due at once, to report early what cannot be saved.
         """
-        integer(1)("checkpoint_every", every)
-        path = Path(path)
-        if self.path is None or self.path.resolve() != path.resolve():
+        self._every, path = integer(1)("checkpoint_every", every), Path(path).resolve()
+        if path != self.path:
             if self.active:
                 raise ValueError(
                     "checkpoint_path must be one folder for a call of learn(), got "
                     f"{self.path} and {path}"
                 )
-            source = self._resumed_from
-            if source is not None and source.path.resolve() == path.resolve():
-                self._store = source
-                self._last = self._run().first.num_timesteps
-            else:
+            if self._store is None or self._store.path != path:  # else it was resumed from there
                 store = CheckpointStore(path)
                 folders = store.folders()
                 if folders or path.is_file():
@@ -122,9 +116,8 @@ class RunCheckpoints:
                         f"{content}: resume that run, or choose another folder"
                     )
                 self._store, self._rows, self._last = store, RowFiles(), None
-                self._resumed_from = None
             self.path = path
-        self._every, self.active = every, True
+        self.active = True
         self._signals.watch()
 
     def stop(self) -> None:
@@ -168,7 +161,7 @@ class RunCheckpoints:
             self._write(run)
         return not stop
 
-    def load(self, store: CheckpointStore, checkpoint: Checkpoint) -> None:
+    def load(self, checkpoint: Checkpoint) -> None:
         """Restore a checkpoint's state in agents that have been loaded.
 
         Raises:
@@ -179,8 +172,7 @@ class RunCheckpoints:
             check_same_build(env, manifest["layers"][name])
         parts = th.load(checkpoint.folder / _STATE, weights_only=True)
         state.restore_early(run, parts["early"])
-        self._rows = RowFiles()
-        ring = run.ring()
+        self._rows, ring = RowFiles(), run.ring()
         if ring is None:
             for name, agent in run.agents.items():
                 path = checkpoint.folder / f"{name}.buffer.pkl"
@@ -191,13 +183,16 @@ class RunCheckpoints:
                     "buffer_size must be as when the checkpoint was written, "
                     f"{manifest['capacity']} steps of each environment, got {ring.capacity}"
                 )
-            files = [Segment(**one) for one in manifest["segments"]]
-            segments.fill(ring.columns, checkpoint.rows_folder, files)
+            fill(ring.columns, checkpoint.rows_folder, manifest["segments"])
             for agent in run.agents.values():
                 buffer: Any = agent.replay_buffer
                 buffer.pos, buffer.full = manifest["pos"], manifest["full"]
-            self._rows = RowFiles(ring.source, files, run.first.num_timesteps // run.first.n_envs)
-        self._late, self._begun, self._resumed_from = parts["late"], manifest["begun"], store
+            now = replace(ring, pos=manifest["pos"], full=manifest["full"])
+            steps = run.first.num_timesteps // run.first.n_envs
+            self._rows.note(now, steps, manifest["segments"])
+        self._store = CheckpointStore(checkpoint.folder.parent, [checkpoint])
+        self._last = manifest["num_timesteps"]
+        self._late, self._begun = parts["late"], manifest["begun"]
 
     def _run(self, callbacks: Mapping[str, BaseCallback] | None = None) -> Run:
         run = self._describe()
@@ -206,44 +201,51 @@ class RunCheckpoints:
 
     def _write(self, run: Run) -> None:
         """Write a checkpoint, unless this step has one."""
-        assert self._store is not None
-        now = run.first.num_timesteps
+        now, ring = run.first.num_timesteps, run.ring()
         if now == self._last:
             return
+        assert self._store is not None
+        steps = now // run.first.n_envs
 
-        def write_files(folder: Path, new_rows: Path) -> dict[str, Any]:
+        def write_files(folder: Path, prefix: Path) -> dict[str, Any]:
             for name, agent in run.agents.items():
                 agent.save(folder / f"{name}.zip")
             th.save(state.collect(run), folder / _STATE)
-            ring = run.ring()
             if ring is None:
                 for name, agent in run.agents.items():
                     agent.save_replay_buffer(folder / f"{name}.buffer.pkl")
                 return {}
-            files = self._rows.update(ring, now // run.first.n_envs, new_rows)
+            files = self._rows.write(ring, steps, prefix)
             facts = {"pos": ring.pos, "full": ring.full, "capacity": ring.capacity}
-            return {"segments": [asdict(one) for one in files], **facts}
+            return {"segments": files, **facts}
 
-        try:
-            self._store.write(now, _facts(run), write_files)
-        except BaseException:
-            self._rows = RowFiles()  # the next checkpoint writes all rows again
-            raise
+        facts = {
+            "kind": run.kind,
+            "agents": list(run.agents),
+            "layers": {name: list(layers(env)) for name, env in run.environments.items()},
+            "begun": run.first._num_timesteps_at_start,
+            "versions": {
+                "torch": th.__version__,
+                "stable_baselines3": stable_baselines3.__version__,
+            },
+        }
+        checkpoint = self._store.write(now, facts, write_files)
+        if ring is not None:
+            self._rows.note(ring, steps, checkpoint.manifest["segments"])
         self._last = now
 
 
-def open_checkpoint(path: str | Path, kind: str) -> tuple[CheckpointStore, Checkpoint]:
+def open_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     """Find the newest undamaged checkpoint of a folder.
 
     Raises:
         ValueError: If there is none, or it belongs to another class than ``kind``.
     """
-    store = CheckpointStore(path)
-    checkpoint = store.newest()
+    checkpoint = CheckpointStore(path).newest()
     found = checkpoint.manifest["kind"]
     if found != kind:
         raise ValueError(f"path must hold checkpoints of {kind}, got {path}, of {found}")
-    return store, checkpoint
+    return checkpoint
 
 
 def load_agent(
@@ -261,13 +263,3 @@ def load_agent(
     check_same_build(env, checkpoint.manifest["layers"][name])
     path = checkpoint.folder / f"{name}.zip"
     return algorithm.load(path, env=env, device=device, force_reset=False)
-
-
-def _facts(run: Run) -> dict[str, Any]:
-    return {
-        "kind": run.kind,
-        "agents": list(run.agents),
-        "layers": {name: list(layers(env)) for name, env in run.environments.items()},
-        "begun": run.first._num_timesteps_at_start,
-        "versions": {"torch": th.__version__, "stable_baselines3": stable_baselines3.__version__},
-    }

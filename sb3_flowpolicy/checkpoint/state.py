@@ -17,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flowpolicy.checkpoint import environments, logs, pickling
-from sb3_flowpolicy.checkpoint.segments import Ring
+from sb3_flowpolicy.checkpoint.rows import Ring
 
 # Attributes of SB3's that its load() leaves out or creates anew, and counters.
 _ATTRIBUTES = (
@@ -47,6 +47,7 @@ class Run:
         extra: Returns the state of the rest.
         set_extra: Restores it.
         callbacks: The callback that each agent's ``learn`` was given, while it runs.
+        opaque: Environments that cannot be pickled.
     """
 
     kind: str
@@ -57,7 +58,6 @@ class Run:
     set_extra: Callable[[dict[str, Any]], None]
     callbacks: dict[str, BaseCallback] = field(default_factory=dict)
     opaque: set[str] = field(default_factory=set)
-    """Environments that cannot be pickled."""
 
     @property
     def first(self) -> OffPolicyAlgorithm:
@@ -106,11 +106,27 @@ def collect(run: Run) -> dict[str, bytes]:
 
     Environments that cannot be pickled are left out, with one warning.
     """
+    return {"early": _pickle(run, _early), "late": _pickle(run, _late)}
+
+
+def _pickle(run: Run, part: Callable[[Run], dict[str, Any]]) -> bytes:
+    """Pickle; if that fails, leave out the environments that cannot be pickled from now on."""
     known = run.known()
-    return {
-        "early": _pickle_around_environments(run, lambda: _early(run), known),
-        "late": _pickle_around_environments(run, lambda: _late(run), known),
-    }
+    try:
+        return pickling.dumps(part(run), known)
+    except Exception:  # anything a user's environment raises
+        for name, env in {**run.environments, **run.callback_environments()}.items():
+            try:
+                pickling.dumps(environments.layer_states(env), known)
+            except Exception as error:
+                run.opaque.add(name)
+                warnings.warn(
+                    f"the state of environment {env} cannot be saved ({type(error).__name__}: "
+                    f"{error}): a resumed run will begin a new episode, which is not exact",
+                    RuntimeWarning,
+                    stacklevel=4,
+                )
+        return pickling.dumps(part(run), known)
 
 
 def restore_early(run: Run, pickled: bytes) -> None:
@@ -198,27 +214,6 @@ def _late(run: Run) -> dict[str, Any]:
         "extra": run.extra(),
         "random": _random_state(),
     }
-
-
-def _pickle_around_environments(
-    run: Run, collect: Callable[[], dict[str, Any]], known: Mapping[str, object]
-) -> bytes:
-    """Pickle; if that fails, leave out the environments that cannot be pickled from now on."""
-    try:
-        return pickling.dumps(collect(), known)
-    except Exception:  # anything a user's environment raises
-        for name, env in {**run.environments, **run.callback_environments()}.items():
-            try:
-                pickling.dumps(environments.layer_states(env), known)
-            except Exception as error:
-                run.opaque.add(name)
-                warnings.warn(
-                    f"the state of environment {env} cannot be saved ({type(error).__name__}: "
-                    f"{error}): a resumed run will begin a new episode, which is not exact",
-                    RuntimeWarning,
-                    stacklevel=5,
-                )
-        return pickling.dumps(collect(), known)
 
 
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:

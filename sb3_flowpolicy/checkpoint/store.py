@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,11 +50,12 @@ class CheckpointStore:
 
     Args:
         path: The folder; made when the first checkpoint is written.
+        good: Checkpoints in it to keep, oldest first.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self._good: list[Checkpoint] = []
+    def __init__(self, path: str | Path, good: Sequence[Checkpoint] = ()) -> None:
+        self.path = Path(path).resolve()
+        self._good = list(good)
 
     def folders(self) -> list[Path]:
         """Return the folders of checkpoints, damaged ones included, oldest first."""
@@ -81,7 +82,6 @@ class CheckpointStore:
                 RuntimeWarning,
                 stacklevel=3,
             )
-        self._good = [checkpoint]
         return checkpoint
 
     def _search(self) -> tuple[Checkpoint | None, list[str]]:
@@ -105,8 +105,8 @@ class CheckpointStore:
         Args:
             num_timesteps: Environment steps so far.
             facts: What the manifest says.
-            write_files: Function of the checkpoint's folder and of a path for new rows; writes
-                files and returns more facts, among them the ``segments`` that hold the rows.
+            write_files: Function of the checkpoint's folder and of a prefix for files of new rows;
+                writes files and returns more facts, among them the ``segments`` that hold the rows.
 
         Returns:
             The checkpoint.
@@ -118,10 +118,8 @@ class CheckpointStore:
             shutil.rmtree(leftover)
         partial.mkdir(parents=True)
         rows.mkdir(exist_ok=True)
-        new_rows = rows / f"{number:05d}.npz"
-        new_rows.unlink(missing_ok=True)
         facts = {"format": FORMAT, "num_timesteps": num_timesteps, **facts}
-        facts |= write_files(partial, new_rows)
+        facts |= write_files(partial, rows / f"{number:05d}")
         own = {f"{name}/{path.name}": _digest(path, True) for path in sorted(partial.iterdir())}
         known = self._good[-1].manifest["files"] if self._good else {}
         for segment in facts.get("segments", []):

@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
-from sb3_flowpolicy.checkpoint.segments import Ring
+from sb3_flowpolicy.checkpoint.rows import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import number
@@ -142,14 +142,14 @@ class SeedBatch:
             ValueError: If the folder holds no undamaged checkpoint of a batch, or the environment
                 does not fit.
         """
-        store, checkpoint = open_checkpoint(path, cls.__name__)
+        checkpoint = open_checkpoint(path, cls.__name__)
         agents = {
             name: load_agent(algorithm, checkpoint, name, algorithm._wrap_env(make_env(env)), "cpu")
             for name in checkpoint.manifest["agents"]
         }
         batch = cls.__new__(cls)
         batch._set_up(agents, env, monitor_dir, info_keywords)
-        batch._checkpoints.load(store, checkpoint)
+        batch._checkpoints.load(checkpoint)
         return batch
 
     def learn(
