@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch as th
-import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.common.command_line import HelpFormatter, at_least, run
+from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least, run
 from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.seeds.batch import SeedBatch
@@ -49,10 +48,13 @@ def main(arguments: list[str] | None = None) -> None:
     evaluates = args.eval_freq is not None and args.eval_freq > 0
     every = args.eval_freq if evaluates else total
     done, first = batch.models[0].num_timesteps, True
-    end = min(max(1, math.ceil(done / every)) * every, total)
-    left = max(0, total - done)
-    print(f"{args.algo} on {args.env}, seeds {batch.seeds}: {left} steps each", flush=True)
-    while True:
+    # A run that was interrupted before a test is tested first.
+    ends = [*range(max(1, math.ceil(done / every)) * every, total, every), total]
+    print(
+        f"{args.algo} on {args.env}, seeds {batch.seeds}: {max(0, total - done)} steps each",
+        flush=True,
+    )
+    for end in ends:
         if done < end:
             batch.learn(
                 # The first call counts from zero, that of a resumed batch included.
@@ -68,9 +70,6 @@ def main(arguments: list[str] | None = None) -> None:
         if evaluates:
             _record(folder / "evaluations.csv", batch.seeds, done, returns)
             print(f"  step {done:<8} test return {np.mean(returns):8.2f}", flush=True)
-        if end >= total:
-            break
-        end = min(end + every, total)
     for seed, model in zip(batch.seeds, batch.models, strict=True):
         model.save(folder / f"seed_{seed}.zip")
     _report(batch.seeds, returns)
@@ -78,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _new_batch(args: argparse.Namespace, folder: Path) -> SeedBatch:
-    settings = {**load_hyperparameters(args.algo, args.env), **_overrides(args.hyperparams)}
+    settings = {**load_hyperparameters(args.algo, args.env), **dict(args.hyperparams)}
     settings.pop("n_timesteps", None)
     return SeedBatch(
         settings.pop("policy"),
@@ -89,20 +88,6 @@ def _new_batch(args: argparse.Namespace, folder: Path) -> SeedBatch:
         device="cpu",
         **settings,
     )
-
-
-def _overrides(pairs: list[str]) -> dict[str, Any]:
-    """Read ``key:value``, the value as YAML."""
-    settings = {}
-    for pair in pairs:
-        try:
-            key, value = pair.split(":", maxsplit=1)
-            settings[key] = yaml.safe_load(value)
-        except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-            raise ValueError(
-                f"hyperparams must be of the form key:value, the value in YAML, got {pair[:80]!r}"
-            ) from error
-    return settings
 
 
 def _test_returns(batch: SeedBatch, env_id: str, n_episodes: int) -> np.ndarray:
@@ -149,24 +134,21 @@ def _parser() -> argparse.ArgumentParser:
     add("--algo", default="sac_flow", help="sac_flow, sac_lowrank or sac_gauss")
     add("--env", default="TunnelDiagonal-v0", help="environment id")
     add("--seeds", type=at_least(1), default=10, help="number of seeds")
-    add(
-        "--first-seed",
-        type=at_least(0),
-        default=0,
-        help="first of consecutive seeds",
-    )
+    add("--first-seed", type=at_least(0), default=0, help="first of consecutive seeds")
     add("-n", "--n-timesteps", type=at_least(1), help="steps per seed (default: the file's)")
-    add("-params", "--hyperparams", nargs="+", default=[], help="overrides, as key:value")
+    add(
+        *("-params", "--hyperparams"),
+        type=partial(assignment, sign=":"),
+        nargs="+",
+        default=[],
+        metavar="KEY:VALUE",
+        help="overrides, the value in YAML",
+    )
     add("-f", "--log-folder", default="logs", help="where to save agents and monitor files")
     add("-tb", "--tensorboard-log", help="TensorBoard folder, one run per seed")
     add("--eval-episodes", type=at_least(1), default=20, help="test episodes per seed at the end")
     add("--eval-freq", type=int, help="steps between tests, written to evaluations.csv")
-    add(
-        "--num-threads",
-        type=int,
-        default=1,
-        help="torch threads; one is fastest for small networks",
-    )
+    add("--num-threads", type=int, default=1, help="torch threads; one suits small networks")
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--resume", action="store_true", help=_RESUME_HELP)
     return parser

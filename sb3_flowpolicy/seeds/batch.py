@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import copy
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,17 +23,9 @@ from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, settings_key
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.episodes import SeedEpisodes
 from sb3_flowpolicy.seeds.experience import SeedExperience
-from sb3_flowpolicy.seeds.setup import (
-    CallbackFactory,
-    EnvFactory,
-    check_seeds,
-    check_stackable,
-    copy_callback,
-    make_env,
-    make_progress_bar,
-    refuse,
-)
+from sb3_flowpolicy.seeds.setup import EnvFactory, check_seeds, check_stackable, make_env, refuse
 
+CallbackFactory = Callable[[int], BaseCallback]
 SelfBatch = TypeVar("SelfBatch", bound="SeedBatch")
 
 # What agents must agree on, besides the constants of their updates.
@@ -100,22 +93,16 @@ class SeedBatch:
     ) -> None:
         self.env = env
         self.seeds = [int(name.removeprefix("seed_")) for name in agents]
-        self._agents, self._models = agents, list(agents.values())
-        check_stackable(self._models[0])
-        self._runtime = EngineRuntime(self._models, Engine, refuse)
+        #: The agents: ordinary models that save, load, predict and train on their own.
+        self.models = list(agents.values())
+        self._agents = agents
+        check_stackable(self.models[0])
+        self._runtime = EngineRuntime(self.models, Engine, refuse)
         self._checkpoints = RunCheckpoints(self._describe_run)
         self._losses: list[list[float]] | None = None
-        self._logged: Sequence[str] = LOSSES
-        self._experience = SeedExperience(self._models, self.seeds, env)
-        self._episodes = SeedEpisodes(
-            self._models, self.seeds, self._record_losses, monitor_dir, info_keywords
-        )
-        self._guard = TrainingGuard(self._models, self.seeds)
-
-    @property
-    def models(self) -> list[EngineFlow]:
-        """The agents: ordinary models that save, load, predict and train on their own."""
-        return self._models
+        self._experience = SeedExperience(self.models, self.seeds, env)
+        self._episodes = SeedEpisodes(self.models, self.seeds, monitor_dir, info_keywords)
+        self._guard = TrainingGuard(self.models, self.seeds)
 
     @classmethod
     def resume(
@@ -191,22 +178,17 @@ class SeedBatch:
             self._checkpoints.learning(checkpoint_path, checkpoint_every),
             self._runtime.running(watched=callback is not None),
         ):
-            callbacks = self._start(total_timesteps, callback, tb_log_name, reset_num_timesteps)
+            callbacks = self._start(
+                total_timesteps, callback, tb_log_name, reset_num_timesteps, progress_bar
+            )
             self._fit()
             new = self._experience.obs is None or reset_num_timesteps
             if new and not self._resumes_episodes():
                 self._experience.reset()
                 self._episodes.restart()
-            first = self._models[0]
-            to_go = first._total_timesteps - first.num_timesteps
-            bar = make_progress_bar(to_go) if progress_bar else None
-            try:
-                self._run(callbacks, log_interval, bar)
-                self._guard.look()
-            finally:
-                if bar is not None:
-                    bar.close()
-            for one in callbacks:
+            self._run(callbacks, log_interval)
+            self._guard.look()
+            for one in callbacks.values():
                 one.on_training_end()
         return self
 
@@ -216,95 +198,97 @@ class SeedBatch:
         callback: BaseCallback | list[BaseCallback] | CallbackFactory | None,
         tb_log_name: str,
         reset_num_timesteps: bool,
-    ) -> list[BaseCallback]:
-        """Do what SB3's ``learn`` does first, for every agent."""
-        callbacks = []
-        for seed, model in zip(self.seeds, self._models, strict=True):
-            own = copy_callback(callback, seed)
+        progress_bar: bool,
+    ) -> dict[str, BaseCallback]:
+        """Do what SB3's ``learn`` does first, for every agent; return the callbacks to call."""
+        callbacks = {}
+        for seed, (name, model) in zip(self.seeds, self._agents.items(), strict=True):
+            own = callback(seed) if callable(callback) else copy.deepcopy(callback)
             total, reset = self._checkpoints.remaining(total_timesteps, reset_num_timesteps)
-            _, ready = model._setup_learn(total, own, reset, f"{tb_log_name}_seed{seed}")
+            bar = progress_bar and seed == self.seeds[0]
+            end, ready = model._setup_learn(total, own, reset, f"{tb_log_name}_seed{seed}", bar)
             if model._checkpoints.active:
                 model._checkpoints.stop()
                 raise ValueError(
                     "a batch is checkpointed by learn(checkpoint_every=..., checkpoint_path=...), "
                     "got a callback that does so for each agent"
                 )
-            ready.on_training_start({"self": model}, {})
-            callbacks += [ready] if own is not None else []
+            ready.on_training_start({"self": model, "total_timesteps": end}, {})
+            if own is not None or bar:
+                callbacks[name] = ready
         return callbacks
 
     def _fit(self) -> None:
         """Adapt to changes of the agents since the last run."""
-        first = self._models[0]
+        first = self.models[0]
         check_stackable(first)
-        if any(_shared_settings(model) != _shared_settings(first) for model in self._models):
+        if any(_shared_settings(model) != _shared_settings(first) for model in self.models):
             raise ValueError("agents must all have the same settings, got different ones")
         planned = first._planned_updates(first._total_timesteps)
         self._runtime.plan(first._n_updates, planned)
         self._guard.restart(self._checkpoints.path)
         self._experience.fit()
 
-    def _run(self, callbacks: list[BaseCallback], log_interval: int | None, bar: Any) -> None:
+    def _run(self, callbacks: dict[str, BaseCallback], log_interval: int | None) -> None:
         """Alternate between collecting and updating, as SB3 does."""
-        first = self._models[0]
+        first = self.models[0]
         assert isinstance(first.train_freq, TrainFreq)
-        # One callback per agent, or none at all.
-        named = dict(zip(self._agents, callbacks, strict=False))
         going = True
         while going and first.num_timesteps < first._total_timesteps:
-            if not self._checkpoints.between_rollouts(named):
+            if not self._checkpoints.between_rollouts(callbacks):
                 break
-            for one in callbacks:
+            for one in callbacks.values():
                 one.on_rollout_start()
-            collected = 0
-            while going and collected < first.train_freq.frequency:
-                going = self._step(callbacks, log_interval)
-                collected += 1
-            for one in callbacks:
+            for _ in range(first.train_freq.frequency):
+                going = going and self._step(callbacks, log_interval)
+            for one in callbacks.values():
                 one.on_rollout_end()
-            if bar is not None:
-                bar.update(collected)
             if going and first.num_timesteps > first.learning_starts and first.gradient_steps:
                 self._train()
 
-    def _step(self, callbacks: list[BaseCallback], log_interval: int | None) -> bool:
+    def _step(self, callbacks: dict[str, BaseCallback], log_interval: int | None) -> bool:
         """Step all environments once; return whether to continue."""
         rewards, dones, infos = self._experience.step(self._runtime)
-        for model in self._models:
+        for model in self.models:
             model.num_timesteps += 1
             model._current_progress_remaining = 1 - model.num_timesteps / model._total_timesteps
         going = True
-        for k, one in enumerate(callbacks):
+        for k, one in enumerate(callbacks.values()):
             info = info_of(infos.get("final_info", {}) if dones[k] else infos, k)
             one.update_locals({"rewards": rewards[[k]], "dones": dones[[k]], "infos": [info]})
             going = one.on_step() and going
-        self._episodes.step(rewards, dones, infos, log_interval)
+        for k in self._episodes.step(rewards, dones, infos):
+            model = self.models[k]
+            due = log_interval is not None and model._episode_num % log_interval == 0
+            if due and model.logger.output_formats:
+                self._record_losses(k)
+                model.dump_logs()
         return going
 
     def _train(self) -> None:
         """Update all agents ``gradient_steps`` times."""
         engine = self._runtime.engine()
         assert engine is not None
-        first = self._models[0]
+        first = self.models[0]
         rate = first.lr_schedule(first._current_progress_remaining)
         if rate != first.actor.optimizer.param_groups[0]["lr"]:
-            for model in self._models:
+            for model in self.models:
                 for optimizer in model.optimizers().values():
                     update_learning_rate(optimizer, rate)
         self._guard.before_updates()
         batches = self._experience.minibatches(first.gradient_steps)
-        self._losses, self._logged = engine.train(batches).tolist(), engine.logged
-        for model in self._models:
+        self._losses = engine.train(batches).tolist()
+        for model in self.models:
             model._n_updates += first.gradient_steps
         self._guard.after_updates(LOSSES, self._losses, engine.history, batches)
 
     def _record_losses(self, index: int) -> None:
         """Record what SB3 records at each update, just before an agent's log is written."""
-        model = self._models[index]
-        if self._losses is not None:
+        engine, model = self._runtime.engine(), self.models[index]
+        if self._losses is not None and engine is not None:
             rate = model.actor.optimizer.param_groups[0]["lr"]
             model.logger.record("train/learning_rate", rate)
-            model.record_losses(self._losses, index, self._logged)
+            model.record_losses(self._losses, index, engine.logged)
 
     def _describe_run(self) -> Run:
         """Describe what a checkpoint of this batch consists of."""
@@ -319,8 +303,8 @@ class SeedBatch:
         )
 
     def _ring(self) -> Ring:
-        storage, buffer = self._experience.storage, self._experience.storage.buffers[0]
-        return Ring(storage.rows.columns, buffer.pos, buffer.full, storage)
+        rows, buffer = self._experience.rows, self._experience.rows.buffers[0]
+        return Ring(rows.columns, buffer.pos, buffer.full, rows)
 
     def _extra_state(self) -> dict[str, Any]:
         self._guard.look()  # before a checkpoint is written, not after
@@ -328,13 +312,11 @@ class SeedBatch:
             **self._experience.state(),
             "episodes": self._episodes.state(),
             "losses": self._losses,
-            "logged": tuple(self._logged),
             "engine": self._runtime.state(),
         }
 
     def _set_extra_state(self, state: dict[str, Any]) -> None:
         self._losses = state["losses"]
-        self._logged = state.get("logged", LOSSES)  # older checkpoints are of SACFlow
         self._runtime.load_state(state["engine"])
         self._experience.set_state(state)
         self._episodes.set_state(state["episodes"])

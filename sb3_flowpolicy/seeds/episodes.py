@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,6 +12,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
+from sb3_flowpolicy.common.vec_env import info_of
 
 
 class SeedEpisodes:
@@ -20,7 +21,6 @@ class SeedEpisodes:
     Args:
         models: One model per environment.
         seeds: Their seeds, for file names.
-        before_dump: Called with a model's index just before its log is written.
         monitor_dir: Folder for ``seed_<seed>.monitor.csv``; None writes none.
         info_keywords: Further numbers to record, from the info of an episode's last step.
     """
@@ -29,12 +29,10 @@ class SeedEpisodes:
         self,
         models: Sequence[OffPolicyAlgorithm],
         seeds: Sequence[int],
-        before_dump: Callable[[int], None],
         monitor_dir: str | Path | None = None,
         info_keywords: Sequence[str] = (),
     ) -> None:
         self.models = models
-        self.before_dump = before_dump
         self.info_keywords = tuple(info_keywords)
         self.returns = np.zeros(len(models))
         self.lengths = np.zeros(len(models), dtype=int)
@@ -47,49 +45,35 @@ class SeedEpisodes:
                 for seed in seeds
             ]
 
-    def step(
-        self,
-        rewards: np.ndarray,
-        dones: np.ndarray,
-        infos: dict[str, Any],
-        log_interval: int | None,
-    ) -> None:
+    def step(self, rewards: np.ndarray, dones: np.ndarray, infos: dict[str, Any]) -> list[int]:
         """Account for one step of all environments.
 
         Args:
             rewards: Rewards, (S,).
             dones: Which episodes ended, (S,).
             infos: Infos of a vectorized environment that resets in the same step.
-            log_interval: Episodes between two dumps of a model's log; None for no dumps.
+
+        Returns:
+            The models whose episodes ended.
         """
         self.returns += rewards
         self.lengths += 1
-        if not dones.any():
-            return
-        final_info = infos.get("final_info", {})
-        success = final_info.get("is_success")
-        for seed in np.flatnonzero(dones).tolist():
-            model = self.models[seed]
+        ended = np.flatnonzero(dones).tolist()
+        for seed in ended:
+            model, info = self.models[seed], info_of(infos.get("final_info", {}), seed)
             episode = {
                 "r": round(float(self.returns[seed]), 6),
                 "l": int(self.lengths[seed]),
                 "t": round(time.time() - self.start, 6),
-                **{name: float(final_info[name][seed]) for name in self.info_keywords},
+                **{name: info[name] for name in self.info_keywords},
             }
-            assert model.ep_info_buffer is not None
-            assert model.ep_success_buffer is not None
-            model.ep_info_buffer.append(episode)
-            if success is not None:
-                model.ep_success_buffer.append(bool(success[seed]))
+            model._update_info_buffer([{**info, "episode": episode}], dones[[seed]])
             if self.writers:
                 self.writers[seed].write_row(episode)
             model._episode_num += 1
-            due = log_interval is not None and model._episode_num % log_interval == 0
-            if due and model.logger.output_formats:
-                self.before_dump(seed)
-                model.dump_logs()
-        self.returns[dones] = 0
-        self.lengths[dones] = 0
+        self.returns[ended] = 0
+        self.lengths[ended] = 0
+        return ended
 
     def restart(self) -> None:
         """Forget the running episodes: their environments were reset."""

@@ -11,15 +11,19 @@ import torch as th
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.engine import EngineRuntime
+from sb3_flowpolicy.engine.replay import ReplayRows
 from sb3_flowpolicy.engine.update import Batch
 from sb3_flowpolicy.guard.finite import check_experience
-from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.seeds.setup import EnvFactory, make_vec_env
-from sb3_flowpolicy.seeds.storage import SeedNoise, SeedStorage
+
+# Random numbers are drawn for this many updates or steps at once, as each call has a fixed cost.
+AHEAD = 64
 
 
 class SeedExperience:
     """Environments, replay buffers and random numbers of S agents.
+
+    The agents' own buffers become views of one array, :attr:`rows`, and can be saved as usual.
 
     Args:
         models: The agents.
@@ -31,30 +35,32 @@ class SeedExperience:
         self.models, self.seeds = models, seeds
         self.venv = make_vec_env(env, len(seeds))
         self.obs: np.ndarray | None = None
-        self.storage = SeedStorage(self._buffers())
+        self.rows = ReplayRows(self._buffers())
         self._exploration = ColoredExploration()
         self._noise: dict[str, SeedNoise] = {}
-        self._fit_noise()
+        self.fit()
 
     def _buffers(self) -> list[Any]:
         return [model.replay_buffer for model in self.models]
 
     def fit(self) -> None:
-        """Adapt to changes of the agents since the last run."""
-        # An agent that was trained on its own has its own buffer since then.
-        if not self.storage.rows.holds(self._buffers()):
-            self.storage = SeedStorage(self._buffers())
-        self.storage.check_equally_filled()
-        self._fit_noise()
+        """Adapt to changes of the agents since the last run.
 
-    def _fit_noise(self) -> None:
-        """Keep the random numbers that fit the agents' settings, and begin the others anew."""
+        Raises:
+            ValueError: Unless all agents have as many transitions.
+        """
+        buffers = self._buffers()
+        if len({(buffer.pos, buffer.full) for buffer in buffers}) > 1:
+            sizes = [buffer.size() for buffer in buffers]
+            raise ValueError(f"replay buffers must be equally filled, got {sizes} transitions")
+        # An agent that was trained on its own has its own buffer since then.
+        if not self.rows.holds(buffers):
+            self.rows = ReplayRows(buffers)
         first, before = self.models[0], self._noise
-        assert isinstance(first.actor, FlowActor)
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
         self._exploration.fit(first, len(self.seeds), self.venv)
         process = self._exploration.process
-        # Name -> shape, and whether it is uniform.
+        # Name -> shape, and whether it is uniform. Those that still fit go on.
         wanted = {
             "random actions": (shape, True),
             "actions": ((1, noise_dim) if process is None else process.white_shape[1:], False),
@@ -74,7 +80,7 @@ class SeedExperience:
         seeds = [seed + step for seed in self.seeds]
         # Typed as one seed, documented as one per environment.
         self.obs, _ = self.venv.reset(seed=seeds)  # type: ignore[arg-type]
-        check_experience({"observations": self.obs}, step, self.name)
+        check_experience({"observations": self.obs}, step, self._name)
         self._exploration.restart()
 
     def step(self, runtime: EngineRuntime) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
@@ -95,9 +101,9 @@ class SeedExperience:
             next_obs = obs.copy()
             for index in np.flatnonzero(dones).tolist():
                 next_obs[index] = infos["final_obs"][index]
-            check_experience({"final observations": next_obs}, step, self.name)
-        check_experience({"observations": obs, "rewards": rewards}, step, self.name)
-        self.storage.add(
+            check_experience({"final observations": next_obs}, step, self._name)
+        check_experience({"observations": obs, "rewards": rewards}, step, self._name)
+        self._store(
             observations=self.obs,
             next_observations=next_obs,
             actions=scaled.reshape(len(scaled), -1),
@@ -114,8 +120,8 @@ class SeedExperience:
         first = self.models[0]
         random_steps = first.learning_starts if first.random_steps is None else first.random_steps
         if first.num_timesteps < random_steps:
-            return (self._noise["random actions"].draw() * 2 - 1).float().numpy()
-        noise = self._noise["actions"].draw()
+            return (self._noise["random actions"].draw()[0] * 2 - 1).float().numpy()
+        noise = self._noise["actions"].draw()[0]
         if self._exploration.process is not None:
             noise = self._exploration.process.step(noise).unsqueeze(1)
         engine = runtime.engine()
@@ -123,14 +129,25 @@ class SeedExperience:
         actions = engine.act(th.from_numpy(obs).unsqueeze(1), noise)
         return actions.squeeze(1).numpy().reshape(len(obs), *(first.action_space.shape or ()))
 
+    def _store(self, **values: np.ndarray) -> None:
+        """Append one transition per seed; each value has a leading axis S."""
+        buffers = self.rows.buffers
+        row = buffers[0].pos
+        for name, value in values.items():
+            self.rows.columns[name][row] = value
+        for buffer in buffers:
+            buffer.pos = (row + 1) % buffer.buffer_size
+            buffer.full = buffer.full or buffer.pos == 0
+
     def minibatches(self, count: int) -> list[Batch]:
         """Draw minibatches of all agents for as many updates."""
-        rows = self._noise["rows"].draw_many(count)
-        noise = self._noise["updates"].draw_many(count).transpose(1, 2)
-        return self.storage.gather(rows, self.models[0].gamma, noise)
+        first, seeds = self.rows.buffers[0], len(self.seeds)
+        rows = (self._noise["rows"].draw(count) * first.size()).long()
+        index = rows.mul_(seeds).add_(th.arange(seeds).unsqueeze(-1))
+        noise = self._noise["updates"].draw(count).transpose(1, 2)
+        return self.rows.take(index, self.models[0].gamma, noise)
 
-    def name(self, index: int) -> str:
-        """Name an agent in an error message."""
+    def _name(self, index: int) -> str:
         return f"seed {self.seeds[index]}"
 
     def state(self) -> dict[str, Any]:
@@ -146,3 +163,45 @@ class SeedExperience:
         for name, one in self._noise.items():
             one.set_state(state["noise"][name])
         self._exploration.load_state(state["exploration"])
+
+
+class SeedNoise:
+    """Random numbers of S seeds, each from a generator of its own.
+
+    A seed's numbers do not depend on the other seeds of its batch.
+
+    Args:
+        seeds: The seeds.
+        shape: Shape of one draw of one seed.
+        stream: Distinguishes several uses by the same seed.
+        uniform: Whether to draw from [0, 1) instead of a standard normal.
+    """
+
+    def __init__(self, seeds: Sequence[int], shape: tuple[int, ...], stream: int, uniform: bool):
+        self.shape = shape
+        self.uniform = uniform
+        states = [np.random.SeedSequence((seed, stream)).generate_state(1) for seed in seeds]
+        self.generators = [th.Generator().manual_seed(int(state[0])) for state in states]
+        self._pool = th.empty(0)
+
+    def draw(self, count: int = 1) -> th.Tensor:
+        """Return the next ``count`` numbers of every seed, (count, S, *shape)."""
+        if not len(self._pool):
+            # Uniform numbers become indices; float32 cannot represent all of a million rows.
+            draw, dtype = (th.rand, th.float64) if self.uniform else (th.randn, th.float32)
+            self._pool = th.stack(
+                [draw(AHEAD, *self.shape, generator=own, dtype=dtype) for own in self.generators], 1
+            )
+        found, self._pool = self._pool[:count], self._pool[count:]
+        return found if len(found) == count else th.cat([found, self.draw(count - len(found))])
+
+    def state(self) -> dict[str, Any]:
+        """Return everything needed to continue with the same numbers."""
+        states = [generator.get_state() for generator in self.generators]
+        return {"generators": states, "pool": self._pool}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state` returned."""
+        for generator, saved in zip(self.generators, state["generators"], strict=True):
+            generator.set_state(saved)
+        self._pool = state["pool"][state.get("next", 0) :]  # older checkpoints have a position

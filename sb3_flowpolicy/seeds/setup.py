@@ -1,17 +1,13 @@
-"""Agents, environments and callbacks that a batch of seeds can work with."""
+"""Seeds, agents and environments that a batch can work with."""
 
 from __future__ import annotations
 
-import copy
 import operator
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from stable_baselines3.common import callbacks
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
@@ -20,7 +16,6 @@ from sb3_flowpolicy.engine import Engine
 from sb3_flowpolicy.engine.replay import is_plain
 
 EnvFactory = Callable[[], gym.Env]
-CallbackFactory = Callable[[int], BaseCallback]
 
 
 def check_seeds(seeds: int | Iterable[int]) -> list[int]:
@@ -36,17 +31,6 @@ def check_seeds(seeds: int | Iterable[int]) -> list[int]:
     if not listed or len(set(listed)) < len(listed) or min(listed) < 0:
         raise ValueError(f"seeds must be one or more different integers from 0 on, got {seeds!r}")
     return listed
-
-
-def copy_callback(
-    callback: BaseCallback | list[BaseCallback] | CallbackFactory | None, seed: int
-) -> BaseCallback | None:
-    """Return a callback for one agent only, as callbacks hold state of the agent they watch."""
-    if isinstance(callback, BaseCallback):
-        return copy.deepcopy(callback)
-    if isinstance(callback, list):
-        return callbacks.CallbackList(copy.deepcopy(callback))
-    return None if callback is None else callback(seed)
 
 
 def check_stackable(model: EngineFlow) -> None:
@@ -95,9 +79,3 @@ def make_vec_env(env: str | EnvFactory, count: int) -> VectorEnv:
         form = "vector_entry_point"
         return gym.make_vec(env, num_envs=count, vectorization_mode=form, autoreset_mode=mode)
     return SyncVectorEnv([partial(make_env, env)] * count, autoreset_mode=mode)
-
-
-def make_progress_bar(total: int) -> Any:
-    """Return the progress bar that SB3 uses."""
-    callbacks.ProgressBarCallback()  # raises ImportError if it is not installed
-    return callbacks.tqdm(total=total)
