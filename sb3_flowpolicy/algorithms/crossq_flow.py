@@ -28,17 +28,6 @@ class CrossQFlow(EngineFlow, CrossQ):
     :class:`~sb3_flowpolicy.TQCFlow`. Like CrossQ it takes vectors as observations, no images
     or dictionaries.
 
-    Args:
-        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``, or a
-            policy class.
-        env: Environment, its registered id, or a ``VecEnv``.
-        *args: Further arguments of CrossQ, in its order.
-        **kwargs: Keyword arguments of CrossQ, and ``compile``, ``autocast``, ``action_noise_color``
-            and ``action_noise_correlation_time`` of :class:`~sb3_flowpolicy.SACFlow`.
-
-    Raises:
-        ValueError: If an argument is out of range.
-
     References:
         CrossQ: Batch Normalization in Deep Reinforcement Learning (Bhatt et al., 2024).
 

@@ -49,7 +49,7 @@ def record_demonstrations(
 
 
 def is_recipe(source: Any) -> bool:
-    """Return whether these are arguments for :func:`follow_recipe` and not demonstrations."""
+    """Whether these are arguments for :func:`follow_recipe` and not demonstrations."""
     return isinstance(source, Mapping) and "controller" in source
 
 
@@ -70,9 +70,6 @@ def follow_recipe(
             function that makes one, such as ``flowpolicy_envs.Holder``.
         n_steps: Number of transitions.
         controller_kwargs: Arguments of that class or function.
-
-    Returns:
-        The arrays of :func:`record_demonstrations`.
 
     Example:
         >>> import flowpolicy_envs
@@ -96,13 +93,7 @@ def follow_recipe(
 
 
 def load_demonstrations(source: str | Path | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Read and validate demonstrations.
-
-    Args:
-        source: Path of an ``.npz`` file, or the arrays themselves.
-
-    Returns:
-        The six arrays of :func:`record_demonstrations`.
+    """Read and validate demonstrations, from an ``.npz`` file or from arrays.
 
     Raises:
         ValueError: If the file does not exist, an array is missing, empty or not finite, or
@@ -138,13 +129,7 @@ def fill_replay_buffer(
     """Append demonstrations, as of :func:`load_demonstrations`, to a replay buffer.
 
     With several environments each gets a run of consecutive rows, and up to n_envs - 1 rows at
-    the end are left out.
-
-    Returns:
-        Number of transitions that were added.
-
-    Raises:
-        ValueError: If the demonstrations do not fit the buffer or the spaces.
+    the end are left out. Returns the number of transitions that were added.
     """
     if buffer is None or isinstance(buffer, DictReplayBuffer) or buffer.optimize_memory_usage:
         raise ValueError(

@@ -68,22 +68,8 @@ class EngineFlow(OffPolicyAlgorithm):
     :class:`~sb3_flowpolicy.engine.EngineRuntime`, which binds it to the compiled engine while it
     learns. This class passes them what happens in SB3's training loop.
 
-    Args:
-        *args: Arguments of the algorithm.
-        compile: Whether to compile the update: several times faster after 10 to 30 seconds of
-            warm-up. ``"auto"`` compiles once calls of :meth:`learn` have planned enough updates to
-            repay it. Compiled or not, the numbers are the same.
-        autocast: Whether matrix products run in bfloat16 (``torch.autocast``). On processors that
-            support it, networks of 128 units or more train 1.2 to 1.6 times as fast, small ones
-            slower. Parameters, optimizer states and replay stay float32; products keep 8 bits.
-        action_noise_color: Exponent of the spectrum of the exploration noise, in [0, 1.5]: 0 is
-            white, 1 pink.
-        action_noise_correlation_time: Instead of a color, the steps after which the
-            autocorrelation of an Ornstein-Uhlenbeck process has fallen to 1/e, above 0.
-        **kwargs: Keyword arguments of the algorithm.
-
-    Raises:
-        ValueError: If an argument is out of range, or the policy belongs to another algorithm.
+    Its arguments are those of the algorithm, and ``compile``, ``autocast``, ``action_noise_color``
+    and ``action_noise_correlation_time`` of :class:`~sb3_flowpolicy.SACFlow`.
     """
 
     actor: Any
@@ -162,9 +148,6 @@ class EngineFlow(OffPolicyAlgorithm):
                 state of that one, the running episode included, and its ``Monitor`` file.
             device: Where to put the networks.
 
-        Returns:
-            The model.
-
         Raises:
             ValueError: If the folder holds no undamaged checkpoint, or one of another algorithm, or
                 the environment does not fit.
@@ -190,17 +173,14 @@ class EngineFlow(OffPolicyAlgorithm):
 
         Args:
             total_timesteps: As in SB3, as are the following.
-            callback: Called at every step.
-            log_interval: Episodes between two dumps of the log.
-            tb_log_name: Name of the TensorBoard run. Default: the stock algorithm's, as in SB3.
-            reset_num_timesteps: Whether to count from zero.
-            progress_bar: Whether to show one.
+            callback: As in SB3.
+            log_interval: As in SB3.
+            tb_log_name: As in SB3. Default: the stock algorithm's name.
+            reset_num_timesteps: As in SB3.
+            progress_bar: As in SB3.
             checkpoint_every: Environment steps between two checkpoints for :meth:`resume`. Ctrl-C
                 and SIGTERM then write one, too, before they stop the program. Default: none.
             checkpoint_path: Folder for them, empty for a new run.
-
-        Returns:
-            The model.
 
         Raises:
             ValueError: If only one of the last two is given, or the folder holds checkpoints of
@@ -400,7 +380,6 @@ class EngineFlow(OffPolicyAlgorithm):
         return _copies(super().get_parameters())
 
     def _describe_run(self) -> Run:
-        """Describe what a checkpoint of this model consists of."""
         return Run(
             kind=type(self).__name__,
             agents={"model": self},

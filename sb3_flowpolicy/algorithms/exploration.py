@@ -41,9 +41,6 @@ class ColoredExploration:
         """Adopt the agent's present settings; a process that already has them continues.
 
         The environment, if it is known, tells how long episodes are.
-
-        Raises:
-            ValueError: If settings are out of range, or the policy has no density of ours.
         """
         color, correlation_time = (
             check(name, getattr(agent, name)) for name, check in SETTINGS.items()

@@ -68,13 +68,9 @@ class NoiseProcess:
         self._starting = th.ones(n_envs, 1, 1, dtype=th.bool)
 
     def step(self, white: th.Tensor) -> th.Tensor:
-        """Return the next noise of every environment.
+        """Return standard normals (N, M) that correlate with those before.
 
-        Args:
-            white: Independent standard normals, (N, J, M), see ``white_shape``.
-
-        Returns:
-            Standard normals that correlate with those before, (N, M).
+        They are made of independent ones, (N, J, M), see ``white_shape``.
         """
         # At the start of an episode there is no past: the first value is drawn afresh.
         decays = th.where(self._starting, 0.0, self._decays)

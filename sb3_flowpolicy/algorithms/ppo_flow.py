@@ -54,18 +54,17 @@ class PPOFlow(PPO):
 
     SB3's :class:`~stable_baselines3.PPO` with additional policy aliases and compiled updates.
 
+    Policies have the names of those of :class:`~sb3_flowpolicy.SACFlow`. There is no colored noise:
+    PPO's ratios assume that successive actions are independent.
+
     Args:
-        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``, their
-            ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
-        env: Environment, its registered id, or a ``VecEnv``.
-        *args: Further arguments of PPO, in its order.
+        *args: Arguments of PPO, in its order.
         compile: Whether to compile updates and the policy that collects experience: several times
             faster after about 15 seconds of warm-up. ``"auto"`` compiles once calls of
             :meth:`learn` have planned enough updates to repay it. Compiled or not, the numbers are
             the same up to rounding. Policies and buffers that the engine does not support (with
             dropout, frozen parameters, dictionary observations, ...) run the stock loop.
-        **kwargs: Keyword arguments of PPO. There is no colored noise: PPO's ratios assume that
-            successive actions are independent.
+        **kwargs: Keyword arguments of PPO.
 
     Raises:
         ValueError: If an argument is out of range.

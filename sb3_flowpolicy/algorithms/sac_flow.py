@@ -141,9 +141,6 @@ class SACFlow(EngineFlow, SAC):
             path: File to write, ``.safetensors`` if it has no suffix.
             vec_normalize: Statistics to include. Default: those of the model's environment.
 
-        Returns:
-            The file's path.
-
         Raises:
             ValueError: If the model has a part that needs code, such as your own features
                 extractor or a learning rate that is a function; the message names it.
@@ -174,9 +171,6 @@ class SACFlow(EngineFlow, SAC):
                 any, are wrapped around it. Default: none, to predict only; normalize
                 observations with ``model.normalization`` if that is not None.
             device: Device of the model.
-
-        Returns:
-            The model.
 
         Raises:
             BundleError: A ``ValueError``, if the file is damaged or holds no such model.

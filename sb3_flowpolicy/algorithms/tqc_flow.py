@@ -17,22 +17,11 @@ from sb3_flowpolicy.policies import tqc
 class TQCFlow(EngineFlow, TQC):
     """Truncated Quantile Critics with action distributions that correlate and bend.
 
-    Supports everything that sb3-contrib's :class:`~sb3_contrib.TQC` does.
-    ``action_noise_color`` and ``action_noise_correlation_time`` make exploration directed, see
-    :class:`~sb3_flowpolicy.algorithms.exploration.ColoredExploration`; :meth:`learn` takes
-    ``checkpoint_every`` and ``checkpoint_path``. Updates equal sb3-contrib's number by number and
-    run on the engine, as those of :class:`~sb3_flowpolicy.SACFlow`.
-
-    Args:
-        policy: ``"FlowPolicy"`` (or ``"MlpPolicy"``), ``"LowRankPolicy"``, ``"GaussPolicy"``,
-            their ``Cnn...`` and ``MultiInput...`` forms, or a policy class.
-        env: Environment, its registered id, or a ``VecEnv``.
-        *args: Further arguments of TQC, in its order.
-        **kwargs: Keyword arguments of TQC, and ``compile``, ``autocast``, ``action_noise_color``
-            and ``action_noise_correlation_time`` of :class:`~sb3_flowpolicy.SACFlow`.
-
-    Raises:
-        ValueError: If an argument is out of range.
+    Supports everything that sb3-contrib's :class:`~sb3_contrib.TQC` does. Policies have the names
+    of those of :class:`~sb3_flowpolicy.SACFlow`, whose arguments ``compile``, ``autocast``,
+    ``action_noise_color`` and ``action_noise_correlation_time`` are also accepted; :meth:`learn`
+    takes ``checkpoint_every`` and ``checkpoint_path``. Updates equal sb3-contrib's number by number
+    and run on the engine.
 
     References:
         Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile

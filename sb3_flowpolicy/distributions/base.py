@@ -35,8 +35,7 @@ class ActionDistribution(nn.Module, ABC):
         context_dim: Number of context features H, at least 1.
 
     Raises:
-        ValueError: If a dimension is not a positive integer, or in the public methods if the last
-            dimension of a tensor has the wrong size.
+        ValueError: In the public methods, if the last dimension of a tensor has the wrong size.
     """
 
     #: Number of standard normals M that one sample consumes.

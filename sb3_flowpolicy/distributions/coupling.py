@@ -61,8 +61,7 @@ class Coupling(nn.Module, ABC):
 class CouplingPair(nn.Module):
     """Two couplings that split the coordinates in the same way and swap roles.
 
-    ``make`` builds a coupling, given the numbers of coordinates that it reads and moves. There are
-    two ``couplings``, or one where the flow's length is odd or D = 1.
+    There is only one where the flow's length is odd or D = 1.
     """
 
     order: th.Tensor
@@ -147,15 +146,12 @@ class CouplingFlow(ActionDistribution):
     the transformation of the only coordinate depends on h alone.
 
     Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
+        action_dim: Number of action dimensions D.
+        context_dim: Number of context features H.
         layers: Number of couplings L, at least 1.
         hidden: Units of the hidden layers of each coupling's network.
         init: ``"identity"`` starts as a standard normal for every h. ``"default"`` leaves
             torch's initialization.
-
-    Raises:
-        ValueError: If ``layers`` or a unit count is not a positive integer, or ``init`` is unknown.
     """
 
     def __init__(

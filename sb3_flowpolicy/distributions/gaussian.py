@@ -38,8 +38,6 @@ class DiagGaussian(ActionDistribution):
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis eq. 2.12.
 
     Example:
-        >>> import torch as th
-        >>> _ = th.manual_seed(0)
         >>> density = DiagGaussian(action_dim=2, context_dim=3)
         >>> u, log_prob = density.rsample_and_log_prob(th.zeros(5, 3), th.randn(5, 2))
         >>> u.shape, log_prob.shape

@@ -54,20 +54,16 @@ class Lattice(DiagGaussian):
     - Gradients of the standard deviations reach the features with on-policy algorithms, too.
 
     Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
+        action_dim: Number of action dimensions D.
+        context_dim: Number of context features H.
         alpha: Scale of the noise of the features, at least 0; 0 gives a diagonal covariance.
 
     References:
         Latent Exploration for Reinforcement Learning (Chiappa et al., 2023).
 
     Example:
-        >>> import torch as th
-        >>> _ = th.manual_seed(0)
-        >>> density = Lattice(action_dim=2, context_dim=16)
-        >>> u, log_prob = density.rsample_and_log_prob(th.zeros(5, 16), th.randn(5, 2))
-        >>> th.allclose(log_prob, density.log_prob(th.zeros(5, 16), u), atol=1e-4)
-        True
+        >>> Lattice(action_dim=2, context_dim=16).mode(th.zeros(5, 16)).shape
+        torch.Size([5, 2])
     """
 
     log_std_head = SoftLogStdHead

@@ -10,11 +10,7 @@ from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 
 
 class StateIndependent(nn.Module):
-    """The same learned value for every context.
-
-    Args:
-        value: The parameter, shape (D,). It is not copied.
-    """
+    """The same learned value (D,) for every context."""
 
     def __init__(self, value: nn.Parameter) -> None:
         super().__init__()
@@ -34,14 +30,9 @@ class LocScale(DiagGaussian):
         shape: Density of z.
 
     Example:
-        >>> import torch as th
         >>> from sb3_flowpolicy.distributions import RealNVP
-        >>> density = LocScale(RealNVP(action_dim=2, context_dim=3))
-        >>> context, noise = th.randn(5, 3), th.randn(5, 2)
-        >>> u, _ = density.rsample_and_log_prob(context, noise)  # a new flow is the identity
-        >>> loc, log_std = density.loc_and_log_std(context)
-        >>> th.allclose(u, loc + log_std.exp() * noise)
-        True
+        >>> LocScale(RealNVP(action_dim=2, context_dim=3)).mode(th.zeros(5, 3)).shape
+        torch.Size([5, 2])
     """
 
     def __init__(self, shape: ActionDistribution) -> None:

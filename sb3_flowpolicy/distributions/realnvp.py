@@ -28,8 +28,6 @@ class RealNVP(CouplingFlow):
         Conditional Generative Flows (Lu and Huang, 2020); thesis eq. 2.14 and Fig. 2.6.
 
     Example:
-        >>> import torch as th
-        >>> _ = th.manual_seed(0)
         >>> flow = RealNVP(action_dim=2, context_dim=3)
         >>> noise = th.randn(5, 2)
         >>> u, log_prob = flow.rsample_and_log_prob(th.randn(5, 3), noise)

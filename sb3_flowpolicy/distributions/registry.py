@@ -29,13 +29,13 @@ def register_distribution(name: str, distribution_class: type[ActionDistribution
     A saved model refers to the density by name, so register it before loading the model, too.
 
     Args:
-        name: Name to register, not taken by another class.
+        name: Name to register.
         distribution_class: Subclass of :class:`ActionDistribution` whose constructor takes
             ``action_dim``, ``context_dim`` and keyword arguments of its own.
 
     Raises:
         TypeError: If the class is not a density.
-        ValueError: If the name is taken.
+        ValueError: If the name is taken by another class.
 
     Example:
         >>> from sb3_flowpolicy.distributions import DiagGaussian

@@ -26,7 +26,6 @@ class TanhSquashed(ActionDistribution):
         Soft Actor-Critic (Haarnoja et al., 2018), appendix C.
 
     Example:
-        >>> import torch as th
         >>> from sb3_flowpolicy.distributions import RealNVP
         >>> density = TanhSquashed(RealNVP(action_dim=2, context_dim=3))
         >>> density.log_prob(th.zeros(1, 3), th.ones(1, 2)).isfinite()  # at the corner of the box

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch as th
 
@@ -25,11 +26,11 @@ def adam_settings(optimizer: th.optim.Optimizer) -> AdamSettings | None:
     if type(optimizer) not in (th.optim.Adam, th.optim.AdamW) or len(optimizer.param_groups) != 1:
         return None
     group = optimizer.param_groups[0]
-    if group["amsgrad"] or group["maximize"] or not isinstance(group["weight_decay"], float | int):
+    decay = group["weight_decay"]
+    if group["amsgrad"] or group["maximize"] or not isinstance(decay, float | int):
         return None
     beta1, beta2 = group["betas"]
-    decoupled = type(optimizer) is th.optim.AdamW
-    return AdamSettings(beta1, beta2, group["eps"], group["weight_decay"], decoupled)
+    return AdamSettings(beta1, beta2, group["eps"], decay, type(optimizer) is th.optim.AdamW)
 
 
 def why_optimizer_unsupported(optimizer: th.optim.Optimizer, network: th.nn.Module) -> str | None:
@@ -47,13 +48,20 @@ def why_optimizer_unsupported(optimizer: th.optim.Optimizer, network: th.nn.Modu
     return None
 
 
-class FlatAdam:
-    """Moments of S optimizers as tensors (S, P); the optimizers' own states become views.
+# Names of an optimizer's own entries.
+_KEYS = ("step", "exp_avg", "exp_avg_sq")
 
-    Args:
-        flat: The parameters.
-        optimizers: One Adam or AdamW per seed, over exactly these parameters.
-    """
+
+class Moments(NamedTuple):
+    """State of S Adams."""
+
+    mean: th.Tensor  # first moments, (S, P)
+    square: th.Tensor  # second moments, (S, P)
+    step: th.Tensor  # steps taken so far, (S, number of parameters): one each, as in torch.optim
+
+
+class FlatAdam:
+    """Moments of S optimizers as tensors (S, P); the optimizers' own states become views."""
 
     def __init__(self, flat: FlatParameters, optimizers: list[th.optim.Optimizer]) -> None:
         settings = adam_settings(optimizers[0])
@@ -66,22 +74,19 @@ class FlatAdam:
     def bind(self) -> None:
         """Take over the optimizers' states and make them views of ours."""
         data = self.flat.data
-        self.mean, self.square = th.zeros_like(data), th.zeros_like(data)
-        # One count per parameter, as in torch.optim, although they never differ.
-        n_owners = len(self.flat.views(data, 0))
-        self.step = th.zeros(len(data), n_owners, device=data.device)
+        steps = th.zeros(len(data), len(self.flat.views(data, 0)), device=data.device)
+        self.moments = Moments(th.zeros_like(data), th.zeros_like(data), steps)
         self._bound = []
         for seed, optimizer in enumerate(self.optimizers):
             entries = []
-            pairs = self.flat.views(self.mean, seed), self.flat.views(self.square, seed)
-            for step, (owner, mean), (_, square) in zip(self.step[seed], *pairs, strict=True):
+            means, squares = (self.flat.views(part, seed) for part in self.moments[:2])
+            for (owner, mean), (_, square), step in zip(means, squares, steps[seed], strict=True):
                 entries.append((owner, mean, square))
                 state = optimizer.state[owner]
-                if state:
-                    step.copy_(state["step"])
-                    mean.copy_(state["exp_avg"])
-                    square.copy_(state["exp_avg_sq"])
-                state.update(step=step, exp_avg=mean, exp_avg_sq=square)
+                for key, view in zip(_KEYS, (step, mean, square), strict=True):
+                    if key in state:
+                        view.copy_(state[key])
+                    state[key] = view
             self._bound.append((optimizer, optimizer.state, entries))
 
     def is_bound(self) -> bool:
@@ -90,10 +95,8 @@ class FlatAdam:
             if optimizer.state is not state or len(state) != len(entries):
                 return False
             for owner, mean, square in entries:
-                entry = state.get(owner)
-                if entry is None or entry.get("exp_avg") is not mean:
-                    return False
-                if entry.get("exp_avg_sq") is not square:
+                entry = state.get(owner, {})
+                if entry.get("exp_avg") is not mean or entry.get("exp_avg_sq") is not square:
                     return False
         return True
 
@@ -101,39 +104,28 @@ class FlatAdam:
         """Give the optimizers memory of their own again."""
         for optimizer in self.optimizers:
             for state in optimizer.state.values():
-                for key in ("step", "exp_avg", "exp_avg_sq"):
-                    if key in state:
-                        state[key] = state[key].clone()
+                state.update({key: state[key].clone() for key in _KEYS if key in state})
 
 
 def adam_step(
     parameters: th.Tensor,
     gradient: th.Tensor,
-    mean: th.Tensor,
-    square: th.Tensor,
-    step: th.Tensor,
+    moments: Moments,
     learning_rate: th.Tensor,
     settings: AdamSettings,
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-    """One step of Adam, or AdamW, as torch computes it.
+    """One step of Adam, or AdamW, as torch computes it, for flat parameters (S, P).
 
-    Args:
-        parameters: Flat parameters, (S, P).
-        gradient: Their gradient, (S, P).
-        mean: First moments, (S, P).
-        square: Second moments, (S, P).
-        step: Steps taken so far, (S, number of parameters), all the same.
-        learning_rate: Learning rate, 0-dimensional, float64.
-        settings: Betas, epsilon and weight decay.
+    The learning rate is 0-dimensional, in float64.
 
     Returns:
-        New parameters, first moments, second moments and step counts.
+        New parameters and moments.
 
     References:
         Adam (Kingma and Ba, 2015); Decoupled Weight Decay Regularization (Loshchilov and Hutter,
         2019).
     """
-    step = step + 1
+    mean, square, step = moments.mean, moments.square, moments.step + 1
     # float64, because 1 - 0.999^t needs its digits.
     count = step[:, :1].double()
     dtype = parameters.dtype

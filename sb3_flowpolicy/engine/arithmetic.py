@@ -20,10 +20,7 @@ _SHARED_AMONG_THREADS = 1 << 16
 
 @contextmanager
 def threads_for(multiply_adds: int) -> Iterator[None]:
-    """Use one thread where the work is too small to share.
-
-    Args:
-        multiply_adds: Size of the work: parameters times rows, about.
+    """Use one thread where the work, about parameters times rows, is too small to share.
 
     Example:
         >>> before = th.get_num_threads()

@@ -13,16 +13,11 @@ import torch as th
 
 
 class Compiled:
-    """A function compiled into one graph per kind of call.
+    """A function of tensors compiled into one graph per kind of call; its closure must not change.
 
     Compilation happens at the first call, which says so: the SAC update takes 10 to 30 seconds,
     less from the second run on, as torch caches it on disk. Where it fails, for want of a C++
     compiler or of a feature of torch, the function runs eagerly from then on, with one warning.
-
-    Args:
-        function: Function of tensors; its closure must not change.
-        name: What to call it in messages.
-        device: Where the tensors are.
     """
 
     def __init__(self, function: Callable[..., Any], name: str, device: th.device) -> None:
@@ -37,12 +32,7 @@ class Compiled:
         return key in self._graphs
 
     def __call__(self, key: Hashable, *arguments: Any) -> Any:
-        """Call the function.
-
-        Args:
-            key: Tells apart calls that need different graphs: other shapes, other flags.
-            *arguments: The function's arguments.
-        """
+        """Call the function; ``key`` tells apart calls that need different graphs."""
         if self.broken:
             return self.function(*arguments)
         graph = self._graphs.get(key)

@@ -15,7 +15,7 @@ from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.engine.observations import why_space_unsupported
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
 from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
-from sb3_flowpolicy.engine.update import LOSSES, Batch, Moments, TrainState, UpdateSettings
+from sb3_flowpolicy.engine.update import LOSSES, Batch, TrainState, UpdateSettings
 from sb3_flowpolicy.policies import FlowActor
 
 
@@ -34,11 +34,7 @@ def settings_key(model: Any) -> tuple[object, ...]:
 class Engine(BoundEngine):
     """Updates S models of SAC, TQC or CrossQ in lockstep.
 
-    Args:
-        models: S models that differ in nothing but weights, data and random numbers. Their method
-            ``objective()`` says what they do with their critics.
-        compiled: Whether to compile the update and the policy. Where no compiler works, both run
-            eagerly, with one warning and the same numbers.
+    Their method ``objective()`` says what they do with their critics.
     """
 
     def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
@@ -92,7 +88,6 @@ class Engine(BoundEngine):
         #: Names of the losses to log of the last :meth:`train`.
         self.logged: tuple[str, ...] = LOSSES
         self._rows: ReplayRows | None = None
-        self._state: TrainState | None = None
         self._grouped: tuple[int, list[tuple[slice, TrainState]]] | None = None
         self._fixed: list[tuple[th.Tensor, int]] = []
         self._learning_rates: tuple[list[float], th.Tensor] | None = None
@@ -141,22 +136,17 @@ class Engine(BoundEngine):
             now is not then or version != before
             for (now, version), (then, before) in zip(fixed, self._fixed, strict=True)
         ):
-            self._state, self._fixed = None, fixed
+            self._grouped, self._fixed = None, fixed
         changed = super().synchronize()
         if changed:
-            self._state = None
+            self._grouped = None
         return changed
 
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
-        """Sample actions for collecting experience.
+        """Sample scaled actions in [-1, 1], (S, N, D), for observations (S, N, ...).
 
-        Args:
-            obs: Observations of N environments per seed, (S, N, ...).
-            noise: Standard normals, (S, N, M). Default: drawn here.
-
-        Returns:
-            Scaled actions in [-1, 1], (S, N, D).
+        The noise consists of standard normals, (S, N, M), by default drawn here.
         """
         actor = self.networks.actor.data
         if noise is None:
@@ -181,43 +171,31 @@ class Engine(BoundEngine):
             noise = self.networks.actor.data.new_zeros(shape)
         return self.act(rows, noise).squeeze(0).cpu().numpy()
 
-    def state(self) -> TrainState:
-        """Return the tensors that an update changes."""
-        if self._state is None:
-            self._state = self._gather_state()
-            self._grouped = None
-        return self._state
-
     def _fixed_ent_coefs(self) -> list[th.Tensor]:
         return [] if self.log_ent_coef else [model.ent_coef_tensor for model in self.models]
 
     def _groups(self, batch_size: int) -> list[tuple[slice, TrainState]]:
-        """Return the seeds that are updated together, and their part of the state."""
-        state, count = self.state(), len(self.models)
+        """Return the seeds that are updated together, and what an update of them changes."""
         if self._grouped is None or self._grouped[0] != batch_size:
+            if self.log_ent_coef is not None:
+                ent_coef = self.log_ent_coef.data
+            else:
+                ent_coef = th.stack([tensor.reshape(1) for tensor in self._fixed_ent_coefs()])
+            state = TrainState(
+                self.networks.actor.data,
+                self.networks.critic.data,
+                tuple(part.data for part in self.networks.others),
+                ent_coef,
+                self.actor_adam.moments,
+                self.critic_adam.moments,
+                None if self.ent_coef_adam is None else self.ent_coef_adam.moments,
+            )
+            count = len(self.models)
             size = seeds_at_once(self.models[0].critic, count, batch_size)
             slices = [slice(start, start + size) for start in range(0, count, size)]
             groups = [(seeds, state if size == count else state.of(seeds)) for seeds in slices]
             self._grouped = batch_size, groups
         return self._grouped[1]
-
-    def _gather_state(self) -> TrainState:
-        def moments(adam: FlatAdam) -> Moments:
-            return Moments(adam.mean, adam.square, adam.step)
-
-        if self.log_ent_coef is not None:
-            ent_coef = self.log_ent_coef.data
-        else:
-            ent_coef = th.stack([tensor.reshape(1) for tensor in self._fixed_ent_coefs()])
-        return TrainState(
-            self.networks.actor.data,
-            self.networks.critic.data,
-            tuple(part.data for part in self.networks.others),
-            ent_coef,
-            moments(self.actor_adam),
-            moments(self.critic_adam),
-            None if self.ent_coef_adam is None else moments(self.ent_coef_adam),
-        )
 
     def draw(self, n_updates: int, batch_size: int) -> list[Batch]:
         """Draw minibatches and noise for ``n_updates`` updates at once."""

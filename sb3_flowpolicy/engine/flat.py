@@ -23,7 +23,6 @@ class FlatParameters:
         copies: Whether entries are presented with a leading axis C for their copies.
 
     Example:
-        >>> import torch as th
         >>> linear = th.nn.Linear(2, 1)
         >>> flat = FlatParameters([{"weight": [linear.weight], "bias": [linear.bias]}])
         >>> _ = flat.data.zero_()

@@ -15,14 +15,9 @@ BYTES_AT_ONCE = 700_000
 def seeds_at_once(critic: Any, n_seeds: int, batch_size: int) -> int:
     """Return how many of S seeds to update together: a divisor of S.
 
-    The critics' widest layer decides: its activations are the largest tensors of an update that
-    BYTES_AT_ONCE was measured with. What a loss needs is not counted, such as the differences of
-    all pairs of quantiles in TQC. On a GPU all seeds go together.
-
-    Args:
-        critic: The critics of one seed.
-        n_seeds: Number of seeds.
-        batch_size: Rows of a minibatch.
+    The widest layer of one seed's critics decides: its activations are the largest tensors of an
+    update that BYTES_AT_ONCE was measured with. What a loss needs is not counted, such as the
+    differences of all pairs of quantiles in TQC. On a GPU all seeds go together.
 
     Example:
         >>> from sb3_flowpolicy import SACFlow

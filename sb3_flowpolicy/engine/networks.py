@@ -33,11 +33,8 @@ class StackedNetworks:
     """The networks of S policies that differ in nothing but their weights.
 
     Its functions take the parameters of any number of them, and observations as
-    :class:`~sb3_flowpolicy.engine.observations.Observations` packs them.
-
-    Args:
-        policies: S policies with a :class:`FlowActor` and parameter-free features extractors.
-        autocast: Whether matrix products run in bfloat16; parameters and results stay as they are.
+    :class:`~sb3_flowpolicy.engine.observations.Observations` packs them. With ``autocast`` matrix
+    products run in bfloat16; parameters and results stay as they are.
     """
 
     def __init__(self, policies: Sequence[Any], autocast: bool = False) -> None:
@@ -60,15 +57,9 @@ class StackedNetworks:
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Sample actions and their log-probabilities.
+        """Sample actions (S, B, D) and their log-probabilities (S, B).
 
-        Args:
-            actor: Flat parameters, (S, P).
-            obs: Observations, (S, B, ...).
-            noise: Standard normals, (S, B, M).
-
-        Returns:
-            Actions (S, B, D) and log-probabilities (S, B).
+        From flat parameters (S, P), observations (S, B, ...), and standard normals (S, B, M).
         """
         parameters = self.actor.unflatten(actor)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
@@ -85,7 +76,7 @@ class StackedNetworks:
         actions: th.Tensor,
         normalize: Callable[[str, nn.Module, Tensors, th.Tensor], th.Tensor] | None = None,
     ) -> th.Tensor:
-        """Evaluate all critics of all seeds: each layer is one batched product.
+        """Return values or quantiles (S, C, B, Q): each layer is one batched product.
 
         Args:
             critic: Flat parameters of critics or target critics, (S, P).
@@ -93,9 +84,6 @@ class StackedNetworks:
             actions: Scaled actions, (S, B, D).
             normalize: Applies layers other than linear ones: given a layer's name, the layer, all
                 parameters, and its input, it returns the output.
-
-        Returns:
-            Values or quantiles, (S, C, B, Q).
         """
         hidden = self._critic_inputs(obs, actions)
         parameters = self.critic.unflatten(critic)

@@ -22,9 +22,6 @@ class Observations:
     Only dictionaries differ: their entries are flattened and concatenated, in float32, the type
     in which networks receive observations of any type.
 
-    Args:
-        space: A space for which :func:`why_space_unsupported` returns None.
-
     Example:
         >>> box = spaces.Box(0, 1, (2,))
         >>> observations = Observations(spaces.Dict(achieved=box, desired=box))

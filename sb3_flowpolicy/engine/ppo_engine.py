@@ -23,19 +23,12 @@ from sb3_flowpolicy.engine.ppo_update import (
     policy_function,
 )
 from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
-from sb3_flowpolicy.engine.update import Moments
 from sb3_flowpolicy.policies.base import check_finite
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic
 
 
 class PPOEngine(BoundEngine):
-    """Acts with and updates one policy, whose parameters become views of its tensor.
-
-    Args:
-        models: One PPOFlow model for which :meth:`why_unsupported` returns None.
-        compiled: Whether to compile. Where no compiler works, everything runs eagerly, with one
-            warning and the same numbers.
-    """
+    """Acts with and updates the policy of one PPOFlow model."""
 
     def __init__(self, models: Sequence[PPO], compiled: bool = True) -> None:
         super().__init__(models, compiled)
@@ -80,11 +73,7 @@ class PPOEngine(BoundEngine):
 
     @contextmanager
     def collecting(self, watched: bool = True) -> Iterator[None]:
-        """Let the policy's ``forward`` run compiled within this context.
-
-        Args:
-            watched: Whether callbacks may change the policy meanwhile.
-        """
+        """Let the policy's ``forward`` run compiled, ``watched`` if callbacks may change it."""
         forward = self._act_watched if watched else self.act
         self.policy.forward = forward  # type: ignore[method-assign]
         try:
@@ -132,7 +121,7 @@ class PPOEngine(BoundEngine):
         rate = self.optimizer.param_groups[0]["lr"]
         scalars = th.tensor([rate, clip_range, clip_range_vf], dtype=th.float64)
         scalars = scalars.to(self.flat.data.device)
-        state = PPOState(self.flat.data, Moments(self.adam.mean, self.adam.square, self.adam.step))
+        state = PPOState(self.flat.data, self.adam.moments)
         found: list[th.Tensor] = []
         start_of_epoch, stopped = 0, False
         for epoch in range(model.n_epochs):

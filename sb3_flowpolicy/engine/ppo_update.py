@@ -11,9 +11,8 @@ from torch import nn
 from torch.func import functional_call
 from torch.nn.functional import mse_loss
 
-from sb3_flowpolicy.engine.adam import AdamSettings, adam_step
+from sb3_flowpolicy.engine.adam import AdamSettings, Moments, adam_step
 from sb3_flowpolicy.engine.flat import FlatParameters
-from sb3_flowpolicy.engine.update import Moments
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic, bound_gradient
 
 
@@ -135,9 +134,7 @@ def make_ppo_update(
         (gradient,) = th.autograd.grad(outputs, parameters, gradients)
         norm = gradient.norm()
         gradient = gradient * (settings.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-        stepped = adam_step(
-            state.parameters, gradient, *state.moments, learning_rate, settings.adam
-        )
+        stepped = adam_step(state.parameters, gradient, state.moments, learning_rate, settings.adam)
 
         finite = log_prob.isfinite().all()
         applies = finite

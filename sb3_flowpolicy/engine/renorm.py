@@ -25,7 +25,7 @@ def renormalize(
         layer: Its constants are used.
         x: Inputs, (..., B, F).
         values: The layer's parameters and buffers, (..., F), and ``steps``, broadcastable to them.
-        training: Whether to normalize with the statistics of this batch, and to update the others.
+        training: Whether to normalize with the statistics of this batch.
 
     Returns:
         Outputs (..., B, F), and the new buffers, empty without ``training``.

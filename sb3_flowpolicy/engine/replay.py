@@ -30,11 +30,9 @@ def is_plain(buffer: ReplayBuffer) -> bool:
 class ReplayRows:
     """Replay buffers of S agents as one array, (capacity, environments of all agents, width).
 
-    The buffers' own arrays become views of it, so they can be written and saved as before. All
-    columns are float32, the type in which networks receive observations of any type.
-
-    Args:
-        buffers: Plain SB3 buffers (see :func:`is_plain`) of the same spaces, sizes and contents.
+    The arrays of these plain buffers (see :func:`is_plain`) become views of it, so they can be
+    written and saved as before. All columns are float32, the type in which networks receive
+    observations of any type.
     """
 
     def __init__(self, buffers: Sequence[ReplayBuffer]) -> None:
@@ -72,16 +70,12 @@ class ReplayRows:
         return same and all(getattr(buffer, name) is view for buffer, name, view in self._owned)
 
     def take(self, index: th.Tensor, gamma: float, noise: th.Tensor) -> list[Batch]:
-        """Gather minibatches.
+        """Gather n minibatches.
 
         Args:
             index: Transitions, (n, S, B), counted over all environments of all agents.
             gamma: Discount factor.
-            noise: Standard normals, (n, 2, S, B, M), of the data type and on the device to
-                train with.
-
-        Returns:
-            n batches.
+            noise: Standard normals, (n, 2, S, B, M), of the type and on the device to train with.
         """
         rows = self._flat.index_select(0, index.flatten()).to(noise.device, noise.dtype)
         parts = rows.view(*index.shape, -1).split(self.widths, dim=-1)
@@ -99,11 +93,7 @@ class ReplayRows:
 
 
 def draw_index(buffers: Sequence[ReplayBuffer], n_updates: int, batch_size: int) -> th.Tensor:
-    """Draw transitions with the same random numbers as SB3's own sampling.
-
-    Returns:
-        Indices, (n_updates, S, batch_size), counted over all environments of all agents.
-    """
+    """Draw indices for :meth:`ReplayRows.take` with the same random numbers as SB3's sampling."""
     # SB3's buffers draw from numpy's global generator: rows, then environments, per minibatch.
     draw = np.random.randint
     width = sum(buffer.n_envs for buffer in buffers)
@@ -125,12 +115,6 @@ def sample_columns(
     """Let a model's buffer sample: n-step, HER, VecNormalize, ...
 
     Buffers with independent samples do so once for all updates, others once per update.
-
-    Args:
-        model: SB3's algorithm; its replay buffer is not empty.
-        observations: Packs observations.
-        n_updates: Number of minibatches.
-        batch_size: Transitions per minibatch.
 
     Returns:
         The fields of :class:`Batch` except the noise, each (n_updates, 1, batch_size, ...).

@@ -12,16 +12,8 @@ import torch as th
 from torch import nn
 from torch.utils._pytree import tree_map_only
 
-from sb3_flowpolicy.engine.adam import AdamSettings, adam_step
+from sb3_flowpolicy.engine.adam import AdamSettings, Moments, adam_step
 from sb3_flowpolicy.engine.networks import StackedNetworks
-
-
-class Moments(NamedTuple):
-    """State of one Adam: first and second moments (S, P) and step counts, see ``FlatAdam``."""
-
-    mean: th.Tensor
-    square: th.Tensor
-    step: th.Tensor
 
 
 class TrainState(NamedTuple):
@@ -106,10 +98,8 @@ class Objective(ABC):
     def is_due(self, model: Any, index: int, start: int) -> bool:
         """Return the flag of an update, here: whether to move the target networks.
 
-        Args:
-            model: The model, before the updates that are under way.
-            index: Number of updates among these that come before this one.
-            start: Number of updates before these in the same call of ``train()``.
+        ``start`` updates of the same call of ``train()`` came before the present ones, and
+        ``index`` of these come before this one.
         """
         return (start + index) % model.target_update_interval == 0
 
@@ -174,7 +164,7 @@ def step(
     settings: AdamSettings,
 ) -> None:
     """Take a step of Adam in place."""
-    stepped = adam_step(parameters, gradient, *moments, learning_rate, settings)
+    stepped = adam_step(parameters, gradient, moments, learning_rate, settings)
     write((parameters, *moments), stepped)
 
 
@@ -205,13 +195,8 @@ def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
         L_Q &= L_Q(Q(s, a), y) \\
         L_\pi &= \mathrm{mean} (\alpha \log \pi(\tilde a | s) - V(Q(s, \tilde a)))
 
-    Args:
-        networks: The networks of S seeds.
-        settings: Constants of the update.
-
-    Returns:
-        Function of (state, batch, learning rates of actor, critics and entropy coefficient,
-        whether to move the target networks), which returns the losses (4, S), see ``LOSSES``.
+    It is a function of state, batch, learning rates (of actor, critics and entropy coefficient),
+    and whether to move the target networks, and returns the losses (4, S), see ``LOSSES``.
 
     References:
         Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.

@@ -115,10 +115,7 @@ class FlowActor(Actor):
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, noise: th.Tensor | None = None
     ) -> th.Tensor:
-        """Return the density's mode or a sample, in [-1, 1], shape (batch, D).
-
-        By default the noise is drawn here: standard normals, shape (batch, M).
-        """
+        """Return the mode or a sample, (batch, D), from standard normals (batch, M)."""
         context = self.context(obs)
         if deterministic:
             return self.density.mode(context)
@@ -136,11 +133,7 @@ class FlowActor(Actor):
     def action_log_prob(
         self, obs: PyTorchObs, noise: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
-        """Sample reparametrized actions and score them in one pass.
-
-        Returns:
-            Actions in [-1, 1], shape (batch, D), and their log-density, shape (batch,).
-        """
+        """Sample reparametrized actions (batch, D) and score them (batch,) in one pass."""
         context = self.context(obs)
         noise = self.draw_noise(context) if noise is None else noise
         return self.density.rsample_and_log_prob(context, noise)

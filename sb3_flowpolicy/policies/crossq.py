@@ -74,9 +74,7 @@ class FlowCrossQPolicy(_CrossQ):
 
     Example:
         >>> from sb3_contrib import CrossQ
-        >>> kwargs = dict(net_arch=[16])
-        >>> model = CrossQ(FlowCrossQPolicy, "Pendulum-v1", policy_kwargs=kwargs, learning_starts=9)
-        >>> _ = model.learn(20)
+        >>> model = CrossQ(FlowCrossQPolicy, "Pendulum-v1", policy_kwargs=dict(net_arch=[16]))
     """
 
     default_distribution = "realnvp"

@@ -22,9 +22,9 @@ class DistributionPolicy(DensityPolicy):
     Put it before ``SACPolicy``, ``TQCPolicy`` or ``CrossQPolicy`` among the base classes.
 
     Args:
-        observation_space: As for SB3's policy classes.
+        observation_space: As for SB3.
         action_space: Box with finite bounds, of any shape.
-        lr_schedule: As for SB3's policy classes.
+        lr_schedule: As for SB3.
         distribution: Name of a registered density. Default: that of the policy class.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
         deterministic_mode: How ``predict(..., deterministic=True)`` chooses an action: ``"base"``
@@ -74,7 +74,7 @@ class DistributionPolicy(DensityPolicy):
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """Build the actor; called once, by the algorithm's policy class."""
+        """Build the actor."""
         if self.actor_kwargs["use_sde"]:
             return super().make_actor(features_extractor)  # type: ignore[misc]
         net_args = self._update_features_extractor(self.net_args, features_extractor)

@@ -51,9 +51,9 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
     gradient reaches all parameters.
 
     Args:
-        observation_space: As for SB3's policy classes.
+        observation_space: As for SB3.
         action_space: Box of any shape; with finite bounds if ``squash_output``.
-        lr_schedule: As for SB3's policy classes.
+        lr_schedule: As for SB3.
         distribution: Name of a registered density. Default: that of the policy class.
         distribution_kwargs: Arguments of the density, for example ``dict(layers=4)``.
         squash_output: Whether to squash actions with tanh and rescale them to the action space.
@@ -68,8 +68,7 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
             or ``use_sde=True``.
 
     References:
-        Proximal Policy Optimization Algorithms (Schulman et al., 2017); thesis chapter 5, which
-        proposes these densities for on-policy algorithms.
+        Thesis chapter 5, which proposes these densities for on-policy algorithms.
     """
 
     action_dist: ActionDistributionAdapter
@@ -155,12 +154,7 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
     def score(
         self, obs: PyTorchObs, actions: th.Tensor, noise: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Do the computation of :meth:`evaluate_actions`, given noise.
-
-        Args:
-            obs: Observations of a batch B.
-            actions: Actions, (B, D).
-            noise: Standard normals (K, B, M), to estimate an entropy without closed form.
+        """Do the computation of :meth:`evaluate_actions`, given noise (K, B, M) for the entropy.
 
         Returns:
             Values (B, 1), log-probabilities (B,), and entropies (B,) or None.
@@ -227,13 +221,7 @@ def bound_gradient(gradient: th.Tensor) -> th.Tensor:
 
 
 class GaussActorCriticPolicy(DensityActorCritic):
-    """Diagonal normal distribution for PPO and A2C, the policy of stock PPO.
-
-    Example:
-        >>> from stable_baselines3 import PPO
-        >>> kwargs = dict(distribution="full_covariance", log_std_init=-1.0)
-        >>> model = PPO(GaussActorCriticPolicy, "Pendulum-v1", policy_kwargs=kwargs)
-    """
+    """Diagonal normal distribution for PPO and A2C, the policy of stock PPO."""
 
     default_distribution = "gaussian"
 
@@ -244,9 +232,6 @@ class FlowActorCriticPolicy(DensityActorCritic):
     Example:
         >>> from stable_baselines3 import PPO
         >>> model = PPO(FlowActorCriticPolicy, "Pendulum-v1", n_steps=64).learn(64)
-        >>> obs = model.get_env().reset()
-        >>> model.predict(obs, deterministic=True)[0].shape
-        (1, 1)
     """
 
     default_distribution = "realnvp"

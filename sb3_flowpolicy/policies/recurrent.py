@@ -17,9 +17,7 @@ class FlowLstmPolicy(FlowActorCriticPolicy, RecurrentActorCriticPolicy):
 
     Example:
         >>> from sb3_contrib import RecurrentPPO
-        >>> kwargs = dict(lstm_hidden_size=16)
-        >>> model = RecurrentPPO(FlowLstmPolicy, "Pendulum-v1", n_steps=64, policy_kwargs=kwargs)
-        >>> _ = model.learn(64)
+        >>> model = RecurrentPPO(FlowLstmPolicy, "Pendulum-v1", n_steps=64)
     """
 
     _predict = RecurrentActorCriticPolicy._predict  # type: ignore[assignment]

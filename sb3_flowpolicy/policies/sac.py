@@ -20,13 +20,7 @@ class GaussPolicy(DistributionPolicy, SACPolicy):
 
 
 class LowRankPolicy(DistributionPolicy, SACPolicy):
-    """Normal distribution with low-rank covariance (thesis: LR-Agent), for correlated actions.
-
-    Example:
-        >>> from stable_baselines3 import SAC
-        >>> kwargs = dict(distribution_kwargs=dict(rank=1))
-        >>> model = SAC(LowRankPolicy, "Pendulum-v1", policy_kwargs=kwargs)
-    """
+    """Normal distribution with low-rank covariance (thesis: LR-Agent), for correlated actions."""
 
     default_distribution = "low_rank"
 
@@ -38,9 +32,6 @@ class FlowPolicy(DistributionPolicy, SACPolicy):
         >>> from stable_baselines3 import SAC
         >>> kwargs = dict(distribution_kwargs=dict(layers=6, hidden=(16, 16)))
         >>> model = SAC(FlowPolicy, "Pendulum-v1", policy_kwargs=kwargs)
-        >>> obs = model.get_env().reset()
-        >>> model.predict(obs)[0].shape
-        (1, 1)
     """
 
     default_distribution = "realnvp"

@@ -15,9 +15,6 @@ ENTROPY_PAIRS = 2
 class ActionDistributionAdapter(Distribution):
     """An :class:`ActionDistribution` as an SB3 ``Distribution``; its one parameter is the context.
 
-    Args:
-        density: The density, usually squashed. It is not copied.
-
     Example:
         >>> import torch as th
         >>> from sb3_flowpolicy.distributions import RealNVP, TanhSquashed
@@ -81,17 +78,10 @@ class ActionDistributionAdapter(Distribution):
 def estimate_entropy(
     density: ActionDistribution, context: th.Tensor, noise: th.Tensor
 ) -> th.Tensor:
-    """Estimate the entropy, with gradient: that of the noise plus the mean log-determinant.
+    """Estimate the entropy in nats (batch,), with gradient, from standard normals (K, batch, M).
 
-    Noise is used with both signs, which cancels the terms of the error that are odd in it.
-
-    Args:
-        density: The density.
-        context: Features, (batch, H).
-        noise: Standard normals, (K, batch, M).
-
-    Returns:
-        Entropy in nats, (batch,).
+    It is that of the noise plus the mean log-determinant. Noise is used with both signs, which
+    cancels the terms of the error that are odd in it.
     """
     noise = th.cat([noise, -noise])
     log_prob = density.rsample_and_log_prob(context, noise)[1]

@@ -15,13 +15,7 @@ class GaussTQCPolicy(DistributionPolicy, TQCPolicy):
 
 
 class LowRankTQCPolicy(DistributionPolicy, TQCPolicy):
-    """Normal distribution with low-rank covariance, for correlated actions.
-
-    Example:
-        >>> from sb3_contrib import TQC
-        >>> kwargs = dict(distribution_kwargs=dict(rank=1), n_quantiles=10)
-        >>> model = TQC(LowRankTQCPolicy, "Pendulum-v1", policy_kwargs=kwargs)
-    """
+    """Normal distribution with low-rank covariance, for correlated actions."""
 
     default_distribution = "low_rank"
 

@@ -243,11 +243,11 @@ def test_auto_compiles_once_all_calls_of_learn_together_repay_it(
     asked = []
 
     class Recorder(Engine):
-        def __init__(self, models: Any, compiled: bool, autocast: bool):
+        def __init__(self, models: Any, compiled: bool):
             asked.append(compiled)
-            super().__init__(models, False, autocast)
+            super().__init__(models, False)
 
-    monkeypatch.setattr("sb3_flowpolicy.engine.engine.Engine", Recorder)
+    monkeypatch.setattr("sb3_flowpolicy.algorithms.engine_flow.Engine", Recorder)
     monkeypatch.setattr(runtime, "UPDATES_WORTH_COMPILING", 50)
     model = SACFlow("GaussPolicy", "Pendulum-v1", learning_starts=10, batch_size=8)
     model.learn(40)  # 30 updates

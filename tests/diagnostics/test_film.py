@@ -1,4 +1,4 @@
-"""Videos, sequences and curves."""
+"""Videos and sequences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import flowpolicy_envs  # noqa: F401, registers the environments
-from sb3_flowpolicy.diagnostics.curves import curves_figure, main
 from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
 
 pytest.importorskip("matplotlib")
@@ -56,15 +55,3 @@ def test_videos_hold_all_frames(frames: list[np.ndarray], tmp_path: Path) -> Non
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
     with pytest.raises(ValueError, match="couldn't find the codec"):
         write_video(frames, tmp_path / "film.text", fps=4)
-
-
-def test_curves_show_every_seed_and_the_mean(tmp_path: Path) -> None:
-    path = tmp_path / "evaluations.csv"
-    path.write_text("seed,step,test_return,std\n1,10,2,0\n2,10,4,0\n1,20,6,0\n2,20,8,0\n")
-    lines = curves_figure({"a": path}).axes[0].lines
-    assert [list(line.get_ydata()) for line in lines] == [[2, 6], [4, 8], [3, 7]]
-    main([f"a={path}", "-o", str(tmp_path / "curves.png")])
-    assert (tmp_path / "curves.png").stat().st_size > 1000
-    path.write_text("seed,step\n1,10\n")
-    with pytest.raises(ValueError, match="no field of name test_return"):
-        curves_figure({"a": path})

@@ -287,7 +287,7 @@ def test_released_models_own_their_memory() -> None:
     assert_close(everything(models[0]), before, th.float32)
     with th.no_grad():
         engine.networks.actor.data.zero_()
-        engine.actor_adam.mean.zero_()
+        engine.actor_adam.moments.mean.zero_()
     assert_close(everything(models[0]), before, th.float32)
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_flowpolicy.policies import contrib, tqc
+from sb3_flowpolicy.policies import tqc
 from sb3_flowpolicy.policies.crossq import (
     FlowCrossQPolicy,
     GaussCrossQPolicy,
@@ -111,8 +111,7 @@ def test_several_environments(algorithm: Any, policy: type[BasePolicy]) -> None:
 )
 def test_images_and_dictionaries(alias: str, env: Any, tmp_path: Path) -> None:
     policy = tqc.ALIASES[alias]
-    # Older models refer to policies.contrib.
-    assert getattr(contrib, policy.__name__) is policy is getattr(tqc, policy.__name__)
+    assert policy is getattr(tqc, policy.__name__)
     model = make(TQC, policy, env(), learning_starts=8, batch_size=8).learn(12)
     model.save(tmp_path / "model")
     loaded: OffPolicyAlgorithm = TQC.load(tmp_path / "model")
