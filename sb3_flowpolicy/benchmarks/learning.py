@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from stable_baselines3 import PPO, SAC, HerReplayBuffer
@@ -23,9 +24,14 @@ POLICIES = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
 # Steps per call of learn() and seed, enough to make the overhead of a call negligible.
 CHUNK = 500
 QUICK_START, QUICK_CHUNK = 50, 10
-# rl_zoo3's settings for Pendulum-v1, with shorter rollouts and without gSDE.
-PPO_ENV_ID, N_ENVS, N_STEPS = "Pendulum-v1", 4, 256
-PPO_SETTINGS = {"batch_size": 64, "n_epochs": 10, "gamma": 0.9, "learning_rate": 1e-3}
+# rl_zoo3's settings without gSDE; rollouts on Pendulum-v1 are shorter.
+PPO_SETTINGS: dict[str, dict[str, Any]] = {
+    "Pendulum-v1": {"n_envs": 4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
+    "HalfCheetahBulletEnv-v0": {
+        **{"n_envs": 1, "n_steps": 512, "batch_size": 128, "n_epochs": 20},
+        "policy_kwargs": {"net_arch": [256, 256], "ortho_init": False, "log_std_init": -2},
+    },
+}
 
 
 def zoo_block(algorithm: str, env_id: str) -> dict[str, Any]:
@@ -63,16 +69,19 @@ def benchmarks(quick: bool = False) -> list[Benchmark]:
     ppo = partial(PPOFlow, compile=not quick)
     return [
         Benchmark(f"learn() on {ENV_ID}", "steps", candidates),
-        Benchmark(
-            f"learn() of PPO on {PPO_ENV_ID}",
-            "steps",
-            [
-                Candidate("SB3 PPO", partial(_ppo, PPO, "MlpPolicy", quick)),
-                *(
-                    Candidate(f"PPOFlow {name}", partial(_ppo, ppo, name, quick))
-                    for name in POLICIES
-                ),
-            ],
+        *(
+            Benchmark(
+                f"learn() of PPO on {env_id}",
+                "steps",
+                [
+                    Candidate("SB3 PPO", partial(_ppo, PPO, "MlpPolicy", env_id, quick)),
+                    *(
+                        Candidate(f"PPOFlow {name}", partial(_ppo, ppo, name, env_id, quick))
+                        for name in POLICIES
+                    ),
+                ],
+            )
+            for env_id in PPO_SETTINGS
         ),
     ]
 
@@ -121,9 +130,13 @@ def _sac(
     return _learning(algorithm(env=ENV_ID, **kwargs), warm_up, chunk, chunk * n_seeds)
 
 
-def _ppo(algorithm: Callable[..., Any], policy: str, quick: bool) -> Work:
+def _ppo(algorithm: Callable[..., Any], policy: str, env_id: str, quick: bool) -> Work:
     """Collect a rollout and learn from it per piece of work."""
-    n_steps = QUICK_CHUNK if quick else N_STEPS
-    env = make_vec_env(PPO_ENV_ID, N_ENVS)
-    model = algorithm(policy, env, n_steps=n_steps, **PPO_SETTINGS)
-    return _learning(model, 1, 1, n_steps * N_ENVS)
+    if env_id.endswith("BulletEnv-v0"):
+        import_module("pybullet_envs_gymnasium")
+    settings = dict(PPO_SETTINGS[env_id])
+    n_envs = settings.pop("n_envs")
+    if quick:
+        settings |= {"n_steps": QUICK_CHUNK, "n_epochs": 1}
+    model = algorithm(policy, make_vec_env(env_id, n_envs), **settings)
+    return _learning(model, 1, 1, model.n_steps * n_envs)

@@ -37,7 +37,7 @@ Measure the speed of sb3_flowpolicy and of its baselines on this machine.
   contrib       gradient updates per second of TQCFlow and CrossQFlow against sb3-contrib's TQC
                 and CrossQ
   learn         environment steps per second of learn(): SACFlow on TunnelDiagonal-v0 and PPOFlow
-                on Pendulum-v1 against SB3's
+                on Pendulum-v1 and HalfCheetah against SB3's
   her           the same with hindsight experience replay and dictionary observations
   acting        calls of predict() per second: SAC and PPO, for one observation and for 100
   environments  steps per second of the environments, single and in batches of 64

@@ -37,6 +37,9 @@ def test_quick_run_writes_the_documented_json(
     )
     for row in result["rows"]:
         assert list(row) == fields.split()
+        if row["rate"] is None:  # PyBullet has no wheels for newer Pythons
+            assert "pybullet" in row["note"]
+            continue
         assert len(row["rates"]) == 5
         assert min(row["rates"]) <= row["rate"] <= max(row["rates"])
         assert row["rate"] > 0
