@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from sb3_flowpolicy.experiments import checks
 from sb3_flowpolicy.experiments.experiment import (
     AGENTS,
@@ -13,38 +15,30 @@ from sb3_flowpolicy.experiments.experiment import (
 )
 
 _GAUSS_AND_FLOW = (GAUSS, FLOW)
-_SQUARE_STEPS, _SQUARE_SEEDS = 60_000, 5
-
-
-def _bullet(name: str, setting: str, env_id: str, published: int) -> Experiment:
-    """Make one of the two validation experiments.
-
-    Args:
-        name: Name of the experiment.
-        setting: Name of its setting.
-        env_id: Environment.
-        published: Return that SB3 publishes for its own SAC.
-    """
-    return Experiment(
-        name=name,
-        claim="E1",
-        source="section 3.1, figure 3.1",
-        title=f"{env_id}: do all three agents learn a standard task?",
-        thesis="All three agents learn equally well and end near the tuned results of others, 2053 "
-        "on Walker2D and 3485 on Ant.",
-        settings=(Setting(setting, env_id),),
-        checks=tuple(checks.reaches(setting, "test_return", agent, published) for agent in AGENTS),
-        steps=1_000_000,
-        seeds=3,
-        eval_every=20_000,
-        notes=f"The threshold is the return that SB3 publishes for its SAC, {published}.",
-    )
-
+_on_square = partial(Experiment, steps=60_000, seeds=5, eval_every=4000)
 
 FURTHER_CLAIMS = (
-    _bullet("bullet-walker", "walker", "Walker2DBulletEnv-v0", 2184),
-    _bullet("bullet-ant", "ant", "AntBulletEnv-v0", 3146),
-    Experiment(
+    *(
+        Experiment(
+            name=f"bullet-{name}",
+            claim="E1",
+            source="section 3.1, figure 3.1",
+            title=f"{env_id}: do all three agents learn a standard task?",
+            thesis="All three agents learn equally well and end near the tuned results of others, "
+            "2053 on Walker2D and 3485 on Ant.",
+            settings=(Setting(name, env_id),),
+            checks=tuple(checks.reaches(name, "test_return", agent, least) for agent in AGENTS),
+            steps=1_000_000,
+            seeds=3,
+            eval_every=20_000,
+            notes=f"The threshold is the return that SB3 publishes for its SAC, {least}.",
+        )
+        for name, env_id, least in (
+            ("walker", "Walker2DBulletEnv-v0", 2184),
+            ("ant", "AntBulletEnv-v0", 3146),
+        )
+    ),
+    _on_square(
         name="hold-fixed-alpha",
         claim="E7",
         source="section 3.3.2, figure 3.14",
@@ -58,11 +52,8 @@ FURTHER_CLAIMS = (
             checks.ordered("hold", "train_return", (FLOW, GAUSS)),
             checks.about_equal("hold", "test_return", _GAUSS_AND_FLOW, 0.1),
         ),
-        steps=_SQUARE_STEPS,
-        seeds=_SQUARE_SEEDS,
-        eval_every=4000,
     ),
-    Experiment(
+    _on_square(
         name="hold-fixed-entropy",
         claim="E8",
         source="section 3.3.2, figure 3.16",
@@ -81,11 +72,8 @@ FURTHER_CLAIMS = (
             checks.ordered("target-2", "train_return", (FLOW, GAUSS)),
             checks.about_equal("target-8", "train_return", _GAUSS_AND_FLOW, 0.1),
         ),
-        steps=_SQUARE_STEPS,
-        seeds=_SQUARE_SEEDS,
-        eval_every=4000,
     ),
-    Experiment(
+    _on_square(
         name="move",
         claim="E9",
         source="section 3.3.3, figure 3.17",
@@ -93,12 +81,9 @@ FURTHER_CLAIMS = (
         thesis="NF's actions of the same axis are clearly correlated, LR's less, Gauss's not.",
         settings=(Setting("move", "SquareMove-v1"),),
         checks=(checks.ordered("move", "same_axis_correlation", (FLOW, LOW_RANK, GAUSS)),),
-        steps=_SQUARE_STEPS,
-        seeds=_SQUARE_SEEDS,
-        eval_every=4000,
         measures=("same_axis_correlation",),
     ),
-    Experiment(
+    _on_square(
         name="move-x",
         claim="E10",
         source="section 3.3.3, figures 3.18 and 3.19",
@@ -111,15 +96,13 @@ FURTHER_CLAIMS = (
             checks.at_least_times("move-x", "x_max", FLOW, GAUSS, 1.5),
             checks.ordered("move-x", "x_std", (FLOW, LOW_RANK, GAUSS)),
         ),
-        steps=_SQUARE_STEPS,
         seeds=3,
-        eval_every=4000,
         measures=("same_axis_correlation", "x_std", "x_max"),
         notes="In the thesis the agents differ after about 1.5 million steps. A million takes "
         "three hours of a core here, so these runs are much shorter; the constants of the -v1 "
         "tasks are such that correlation should pay earlier.",
     ),
-    Experiment(
+    _on_square(
         name="find-goal",
         claim="E11",
         source="section 3.4, figure 3.20",
@@ -129,8 +112,5 @@ FURTHER_CLAIMS = (
         settings=(Setting("find-goal", "SquareFindGoal-v1"),),
         agents=_GAUSS_AND_FLOW,
         checks=(checks.ordered("find-goal", "train_success", (FLOW, GAUSS), 0.05),),
-        steps=_SQUARE_STEPS,
-        seeds=_SQUARE_SEEDS,
-        eval_every=4000,
     ),
 )
