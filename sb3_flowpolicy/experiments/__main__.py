@@ -46,19 +46,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _list(args: argparse.Namespace) -> None:
-    line = "{:<22}{:<7}{:>6}{:>9}{:>11}{:>6}{:>10}  {}"
-    head = ("experiment", "claim", "agents", "settings", "steps", "seeds", "time")
+    line = "{:<22}{:<7}{:>6}{:>9}{:>11}{:>6}{:>12}  {}"
+    head = ("experiment", "claim", "agents", "settings", "steps", "seeds", "in all")
     print(line.format(*head, "what it compares"))
     for one in EXPERIMENTS.values():
         missing, plan = what_is_missing(one), work.make_plan(one, args.profile)
         sizes = len(one.agents), len(one.settings), f"{plan.steps:,}", len(plan.seeds)
-        time = work.in_words(work.plan_seconds(plan, args.workers))
+        total = f"{sum(item.all_steps for item in plan.items):,}"
         needs = f" [needs {missing}]" if missing else ""
-        print(line.format(one.name, one.claim, *sizes, time, one.title + needs))
-    print(
-        f"\nTimes are estimates for {args.workers} cores like those of docs/results/experiments.md,"
-        " from measured speeds."
-    )
+        print(line.format(one.name, one.claim, *sizes, total, one.title + needs))
 
 
 def _run(args: argparse.Namespace) -> None:
@@ -75,11 +71,10 @@ def _run(args: argparse.Namespace) -> None:
     with results_folder(out, plan) as folder:
         items = unfinished(folder, plan)
         finished = {item.key for item in plan.items} - {item.key for item in items}
-        time = work.in_words(work.plan_seconds(plan, args.workers))
         print(
             f"{experiment.name} ({experiment.claim}): {len(plan.items)} items of {plan.steps:,} "
             f"steps x {len(plan.items[0].seeds)} seeds, {len(finished)} finished before, "
-            f"about {time} in all on {args.workers} cores\n"
+            f"{args.workers} at a time\n"
             f"Results: {folder}"
         )
         if items:
@@ -141,13 +136,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=Path, help=f"folder for results (default: {outs}, by profile)")
     together = "seeds trained together in a process; fewer spread over more machines"
     add("--seeds-per-item", type=count, default=work.SEEDS_PER_ITEM, help=together)
-    add("--no-progress", action="store_true", help="show no progress bars")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    workers = "processes at a time, one core each"
+    add("--workers", type=count, default=cores, help=workers)
+    add("--no-progress", action="store_true", help="show no progress bars")
     for command in (show, run):
         quick = "quick: two seeds and few steps, to check that everything works"
         command.add_argument("--profile", choices=("full", "quick"), default="full", help=quick)
-        workers = "processes at a time, one core each"
-        command.add_argument("--workers", type=count, default=cores, help=workers)
     add = report.add_argument
     add("--results", type=Path, default=OUT["full"], help="folder that `run` wrote")
     add("--html", type=Path, help="page to write (default: report.html in it)")

@@ -81,7 +81,7 @@ class Section:
         self.table = results_table(evidence) if self.measured else None
         self.facts = facts(evidence)
         self.missing = what_is_missing(self.experiment)
-        self.estimate = work.in_words(work.plan_seconds(work.make_plan(self.experiment), 2))
+        self.steps = sum(item.all_steps for item in work.make_plan(self.experiment).items)
         # Trials must not be taken for results.
         self.reservation = (
             reservation(self.experiment, evidence.settings) if evidence.items else None
@@ -213,7 +213,7 @@ def _markdown(section: Section, images: dict[str, str]) -> str:
     if section.table is None:
         needs = f"Needs {section.missing}. " if section.missing else ""
         paragraphs += [
-            f"Not run yet. {needs}Estimated at {section.estimate} on two cores.",
+            f"Not run yet. {needs}It takes {section.steps:,} steps.",
             f"`{section.facts['command']}`",
         ]
     else:

@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
-from sb3_flowpolicy.experiments.work import Plan, WorkItem, item_seconds
+from sb3_flowpolicy.experiments.work import Plan, WorkItem
 
 # OpenMP and numba read these when a process starts: one thread each, one process per core.
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -64,8 +64,8 @@ class Progress:
         self.items = {item.key: item for item in items}
         self.steps = {key: self.items[key].steps for key in finished}
         self.bar = tqdm(
-            total=sum(item.steps * len(item.seeds) for item in items),
-            initial=sum(item.steps * len(item.seeds) for item in items if item.key in finished),
+            total=sum(item.all_steps for item in items),
+            initial=sum(item.all_steps for item in items if item.key in finished),
             desc="all",
             unit=" steps",
             unit_scale=True,
@@ -115,8 +115,7 @@ def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, worke
             min(workers, len(items)), context, initializer=_start_worker, initargs=(reports,)
         ) as pool,
     ):
-        longest_first = sorted(items, key=item_seconds, reverse=True)
-        running: set[Future] = {pool.submit(_work, item, folder) for item in longest_first}
+        running: set[Future] = {pool.submit(_work, item, folder) for item in items}
         try:
             while running:
                 progress.take(reports)

@@ -1,4 +1,4 @@
-"""Work items, one per agent and setting of an experiment, and how long they take."""
+"""Work items, one per agent and setting of an experiment."""
 
 from __future__ import annotations
 
@@ -21,17 +21,6 @@ TEST_EPISODES = 10
 """Per seed and measurement."""
 # Short runs write this many checkpoints, long ones one per so many steps.
 CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS = 6, 50_000
-
-STEPS_PER_SECOND = {16: 2400.0, 128: 340.0, 256: 99.0}
-"""Units of the critics' layers -> steps per second of NF, summed over ten seeds of one process with
-one thread, on one of two idle cores of an AMD EPYC (docs/benchmarks.md); Gauss is up to a third
-faster. All blocks do one update per step, which dominates the time."""
-
-GSDE_STEPS_PER_SECOND = 250.0
-"""gSDE runs in SB3's own loop, one seed after the other, at this speed for all small networks."""
-
-_START_SECONDS = 40
-"""Starting a process and compiling."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +52,11 @@ class WorkItem:
     test_episodes: int
     measures: tuple[str, ...]
     pictures_at: tuple[int, ...]
+
+    @property
+    def all_steps(self) -> int:
+        """Environment steps of all seeds."""
+        return self.steps * len(self.seeds)
 
     @property
     def updates(self) -> int:
@@ -233,34 +227,3 @@ def environment(item: WorkItem) -> str:
         kwargs = {**base.kwargs, **item.env_kwargs}
         gym.registry[name] = replace(base, id=name, kwargs=kwargs)
     return name
-
-
-def item_seconds(item: WorkItem) -> float:
-    """Estimate the time of an item on one core, seconds."""
-    settings = item.hyperparameters
-    net_arch = settings.get("policy_kwargs", {}).get("net_arch", [256, 256])
-    critic = net_arch["qf"] if isinstance(net_arch, dict) else net_arch
-    speed = STEPS_PER_SECOND[min(STEPS_PER_SECOND, key=lambda known: abs(known - max(critic)))]
-    if settings.get("use_sde"):
-        speed = min(speed, GSDE_STEPS_PER_SECOND)
-    return _START_SECONDS + item.steps * len(item.seeds) / speed
-
-
-def plan_seconds(plan: Plan, workers: int) -> float:
-    """Estimate the time of a plan: each free worker takes the longest remaining item."""
-    loads = [0.0] * workers
-    for seconds in sorted((item_seconds(item) for item in plan.items), reverse=True):
-        loads[loads.index(min(loads))] += seconds
-    return max(loads)
-
-
-def in_words(seconds: float) -> str:
-    """Return a rounded time.
-
-    Example:
-        >>> in_words(95), in_words(5000), in_words(200_000)
-        ('2 min', '1.4 h', '2.3 days')
-    """
-    if seconds < 3600:
-        return f"{max(1, round(seconds / 60))} min"
-    return f"{seconds / 3600:.1f} h" if seconds < 86_400 else f"{seconds / 86_400:.1f} days"

@@ -14,10 +14,7 @@ from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
 from sb3_flowpolicy.experiments.work import (
     environment,
-    in_words,
-    item_seconds,
     make_plan,
-    plan_seconds,
 )
 
 
@@ -74,14 +71,6 @@ def test_seeds_split_into_items() -> None:
     assert [item.seeds for item in plan.items[:3]] == [(100, 101), (102, 103), (104,)]
     keys = [item.key for item in plan.items]
     assert len(set(keys)) == len(keys) == 9
-
-
-def test_costs_add_up() -> None:
-    plan = make_plan(EXPERIMENTS["sparse-fixed-alpha"])
-    seconds = [item_seconds(item) for item in plan.items]
-    assert plan_seconds(plan, 1) == pytest.approx(sum(seconds))
-    assert plan_seconds(plan, 100) == max(seconds)
-    assert in_words(60 * 45) == "45 min"
 
 
 def test_a_worker_process_can_make_bullet_environments() -> None:
