@@ -78,9 +78,9 @@ class DeterministicEpisodes:
         self.venv: VectorEnv = make_vec_env(env, n_models * n_episodes)
 
     def run(
-        self, models: Sequence[EngineFlow], seeds: tuple[int, ...], deterministic: bool = True
+        self, models: Sequence[EngineFlow], seeds: tuple[int, ...]
     ) -> list[tuple[float, float | None]]:
-        """Return mean return and success rate of each policy, exploring if not ``deterministic``.
+        """Return mean return and success rate of each policy.
 
         Episodes start from the same seeds at every call, far from those of training. The success
         rate is None if the environment does not report success.
@@ -92,7 +92,7 @@ class DeterministicEpisodes:
         success = np.full(count, np.nan)
         while running.any():
             actions = [
-                model.predict(part, deterministic=deterministic)[0]
+                model.predict(part, deterministic=True)[0]
                 for model, part in zip(models, np.split(obs, self.n_models), strict=True)
             ]
             obs, rewards, terminated, truncated, infos = self.venv.step(np.concatenate(actions))
