@@ -21,7 +21,6 @@ from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.common.vec_env import info_of
 from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, settings_key
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
-from sb3_flowpolicy.seeds.episodes import SeedEpisodes
 from sb3_flowpolicy.seeds.experience import SeedExperience
 from sb3_flowpolicy.seeds.setup import EnvFactory, check_seeds, check_stackable, make_env, refuse
 
@@ -91,7 +90,6 @@ class SeedBatch:
         monitor_dir: str | Path | None,
         info_keywords: Sequence[str],
     ) -> None:
-        self.env = env
         self.seeds = [int(name.removeprefix("seed_")) for name in agents]
         #: The agents: ordinary models that save, load, predict and train on their own.
         self.models = list(agents.values())
@@ -100,8 +98,7 @@ class SeedBatch:
         self._runtime = EngineRuntime(self.models, Engine, refuse)
         self._checkpoints = RunCheckpoints(self._describe_run)
         self._losses: list[list[float]] | None = None
-        self._experience = SeedExperience(self.models, self.seeds, env)
-        self._episodes = SeedEpisodes(self.models, self.seeds, monitor_dir, info_keywords)
+        self._experience = SeedExperience(self.models, self.seeds, env, monitor_dir, info_keywords)
         self._guard = TrainingGuard(self.models, self.seeds)
 
     @classmethod
@@ -185,7 +182,6 @@ class SeedBatch:
             new = self._experience.obs is None or reset_num_timesteps
             if new and not self._resumes_episodes():
                 self._experience.reset()
-                self._episodes.restart()
             self._run(callbacks, log_interval)
             self._guard.look()
             for one in callbacks.values():
@@ -257,12 +253,9 @@ class SeedBatch:
             info = info_of(infos.get("final_info", {}) if dones[k] else infos, k)
             one.update_locals({"rewards": rewards[[k]], "dones": dones[[k]], "infos": [info]})
             going = one.on_step() and going
-        for k in self._episodes.step(rewards, dones, infos):
-            model = self.models[k]
-            due = log_interval is not None and model._episode_num % log_interval == 0
-            if due and model.logger.output_formats:
-                self._record_losses(k)
-                model.dump_logs()
+        for k in self._experience.record(rewards, dones, infos):
+            if log_interval is not None and self.models[k]._episode_num % log_interval == 0:
+                self._dump_log(k)
         return going
 
     def _train(self) -> None:
@@ -282,13 +275,16 @@ class SeedBatch:
             model._n_updates += first.gradient_steps
         self._guard.after_updates(LOSSES, self._losses, engine.history, batches)
 
-    def _record_losses(self, index: int) -> None:
-        """Record what SB3 records at each update, just before an agent's log is written."""
-        engine, model = self._runtime.engine(), self.models[index]
-        if self._losses is not None and engine is not None:
+    def _dump_log(self, index: int) -> None:
+        """Write an agent's log, after recording what SB3 records at each update."""
+        model = self.models[index]
+        if self._losses is not None:
+            engine = self._runtime.engine()
+            assert engine is not None
             rate = model.actor.optimizer.param_groups[0]["lr"]
             model.logger.record("train/learning_rate", rate)
             model.record_losses(self._losses, index, engine.logged)
+        model.dump_logs()
 
     def _describe_run(self) -> Run:
         """Describe what a checkpoint of this batch consists of."""
@@ -310,7 +306,6 @@ class SeedBatch:
         self._guard.look()  # before a checkpoint is written, not after
         return {
             **self._experience.state(),
-            "episodes": self._episodes.state(),
             "losses": self._losses,
             "engine": self._runtime.state(),
         }
@@ -319,11 +314,10 @@ class SeedBatch:
         self._losses = state["losses"]
         self._runtime.load_state(state["engine"])
         self._experience.set_state(state)
-        self._episodes.set_state(state["episodes"])
         if self._resumes_episodes():
             self._experience.obs = state["obs"]
         else:
-            self._episodes.restart()
+            self._experience.restart_episodes()
 
     def _resumes_episodes(self) -> bool:
         """Whether the next step continues the episodes that a checkpoint interrupted."""

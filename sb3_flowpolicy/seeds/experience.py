@@ -1,15 +1,20 @@
-"""Experience of S agents: collected side by side, stored, and sampled."""
+"""Experience of S agents: collected side by side, recorded, stored, and sampled."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.monitor import ResultsWriter
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
+from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
+from sb3_flowpolicy.common.vec_env import info_of
 from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.engine.replay import ReplayRows
 from sb3_flowpolicy.engine.update import Batch
@@ -21,7 +26,7 @@ AHEAD = 64
 
 
 class SeedExperience:
-    """Environments, replay buffers and random numbers of S agents.
+    """Environments, episodes, replay buffers and random numbers of S agents.
 
     The agents' own buffers become views of one array, :attr:`rows`, and can be saved as usual.
 
@@ -29,16 +34,35 @@ class SeedExperience:
         models: The agents.
         seeds: Their seeds.
         env: Registered id, or a function that makes an environment.
+        monitor_dir: Folder for ``seed_<seed>.monitor.csv``; None writes none.
+        info_keywords: Further numbers to record, from the info of an episode's last step.
     """
 
-    def __init__(self, models: Sequence[EngineFlow], seeds: Sequence[int], env: str | EnvFactory):
-        self.models, self.seeds = models, seeds
+    def __init__(
+        self,
+        models: Sequence[EngineFlow],
+        seeds: Sequence[int],
+        env: str | EnvFactory,
+        monitor_dir: str | Path | None = None,
+        info_keywords: Sequence[str] = (),
+    ) -> None:
+        self.models, self.seeds, self.info_keywords = models, seeds, tuple(info_keywords)
         self.venv = make_vec_env(env, len(seeds))
         self.obs: np.ndarray | None = None
         self.rows = ReplayRows(self._buffers())
         self._exploration = ColoredExploration()
         self._noise: dict[str, SeedNoise] = {}
         self.fit()
+        # Of the running episodes.
+        self.returns, self.lengths = np.zeros(len(seeds)), np.zeros(len(seeds), dtype=int)
+        self._start = time.time()
+        self._writers: list[ResultsWriter] = []
+        if monitor_dir is not None:
+            header: dict[str, float | str] = {"t_start": self._start}
+            self._writers = [
+                ResultsWriter(str(Path(monitor_dir, f"seed_{seed}")), header, self.info_keywords)
+                for seed in seeds
+            ]
 
     def _buffers(self) -> list[Any]:
         return [model.replay_buffer for model in self.models]
@@ -82,6 +106,11 @@ class SeedExperience:
         self.obs, _ = self.venv.reset(seed=seeds)  # type: ignore[arg-type]
         check_experience({"observations": self.obs}, step, self._name)
         self._exploration.restart()
+        self.restart_episodes()
+
+    def restart_episodes(self) -> None:
+        """Forget the running episodes: their environments were reset."""
+        self.returns[:], self.lengths[:] = 0, 0
 
     def step(self, runtime: EngineRuntime) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
         """Step all environments once and store the transitions.
@@ -139,6 +168,30 @@ class SeedExperience:
             buffer.pos = (row + 1) % buffer.buffer_size
             buffer.full = buffer.full or buffer.pos == 0
 
+    def record(self, rewards: np.ndarray, dones: np.ndarray, infos: dict[str, Any]) -> list[int]:
+        """Record what :meth:`step` returned as SB3's ``Monitor`` and algorithms do.
+
+        Returns:
+            The agents whose episodes ended.
+        """
+        self.returns += rewards
+        self.lengths += 1
+        ended = np.flatnonzero(dones).tolist()
+        for index in ended:
+            model, info = self.models[index], info_of(infos.get("final_info", {}), index)
+            episode = {
+                "r": round(float(self.returns[index]), 6),
+                "l": int(self.lengths[index]),
+                "t": round(time.time() - self._start, 6),
+                **{name: info[name] for name in self.info_keywords},
+            }
+            model._update_info_buffer([{**info, "episode": episode}], dones[[index]])
+            if self._writers:
+                self._writers[index].write_row(episode)
+            model._episode_num += 1
+        self.returns[ended], self.lengths[ended] = 0, 0
+        return ended
+
     def minibatches(self, count: int) -> list[Batch]:
         """Draw minibatches of all agents for as many updates."""
         first, seeds = self.rows.buffers[0], len(self.seeds)
@@ -156,6 +209,12 @@ class SeedExperience:
             "noise": {name: one.state() for name, one in self._noise.items()},
             "obs": self.obs,
             "exploration": self._exploration.state(),
+            "episodes": {
+                "returns": self.returns,
+                "lengths": self.lengths,
+                "start": self._start,
+                "texts": read_texts(self._monitor_files()),
+            },
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -163,6 +222,13 @@ class SeedExperience:
         for name, one in self._noise.items():
             one.set_state(state["noise"][name])
         self._exploration.load_state(state["exploration"])
+        episodes = state["episodes"]
+        self.returns, self.lengths = episodes["returns"], episodes["lengths"]
+        self._start = episodes["start"]
+        write_texts(self._monitor_files(), episodes["texts"])
+
+    def _monitor_files(self) -> dict[str, IO[str]]:
+        return {str(index): one.file_handler for index, one in enumerate(self._writers)}
 
 
 class SeedNoise:

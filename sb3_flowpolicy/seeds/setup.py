@@ -19,12 +19,7 @@ EnvFactory = Callable[[], gym.Env]
 
 
 def check_seeds(seeds: int | Iterable[int]) -> list[int]:
-    """Return the seeds as a list.
-
-    Raises:
-        TypeError: If they are not integers.
-        ValueError: If there are none, or they are equal or negative.
-    """
+    """Return the seeds as a list of different integers of at least 0."""
     # ``index`` accepts numpy's integers, too.
     many = seeds if isinstance(seeds, Iterable) else range(operator.index(seeds))
     listed = [operator.index(seed) for seed in many]
