@@ -31,14 +31,8 @@ class BundleError(ValueError):
     """A bundle that is refused; the message names the file, what was expected and what it has."""
 
 
-def write_container(path: Path, config: Any, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a file completely or not at all.
-
-    Args:
-        path: File to create or replace; missing folders are created.
-        config: Dicts, lists, strings, integers, finite floats, booleans and None.
-        arrays: Arrays by name.
-    """
+def write(path: Path, config: Any, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a file completely or not at all; ``config`` is what JSON can hold."""
     # safetensors copies memory as it lies; ascontiguousarray would make scalars one-dimensional.
     plain = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     content = canonical({"config": config, "sha256": checksum(config, plain)})
@@ -47,15 +41,10 @@ def write_container(path: Path, config: Any, arrays: Mapping[str, np.ndarray]) -
         safetensors.numpy.save_file(plain, draft, {_KEY: content})
 
 
-def read_container(path: Path) -> tuple[Any, Arrays]:
-    """Read a file of :func:`write_container`, in memory of about the file's size.
+def read(path: Path) -> tuple[Any, Arrays]:
+    """Return configuration and arrays of a file, in memory of about its size.
 
-    Returns:
-        The configuration and the arrays.
-
-    Raises:
-        ValueError: If it is no such file, or its content is not what was written. The libraries
-            raise exceptions of their own.
+    Besides ``ValueError``, the libraries raise exceptions of their own for damaged files.
     """
     if not path.is_file():  # opening a named pipe would block
         raise ValueError("not a regular file that exists")

@@ -17,30 +17,8 @@ from stable_baselines3.common.utils import check_for_correct_spaces, get_device
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 import sb3_flowpolicy
-from sb3_flowpolicy.bundle import training
-from sb3_flowpolicy.bundle.container import (
-    Arrays,
-    BundleError,
-    canonical,
-    read_container,
-    tensor_like,
-    write_container,
-)
-from sb3_flowpolicy.bundle.normalization import (
-    normalization_from_spec,
-    normalization_of,
-    normalization_to_spec,
-    wrap_env,
-)
-from sb3_flowpolicy.bundle.policy import (
-    class_of,
-    expected_parameters,
-    name_of,
-    plain,
-    policy_from_spec,
-    policy_to_spec,
-)
-from sb3_flowpolicy.bundle.spaces import space_from_spec, space_to_spec
+from sb3_flowpolicy.bundle import container, normalization, policy, spaces, training
+from sb3_flowpolicy.bundle.container import Arrays, BundleError, tensor_like
 from sb3_flowpolicy.common.validation import Check, integer, number
 
 SUFFIX = ".safetensors"
@@ -52,6 +30,7 @@ _PROGRESS: dict[str, Check] = {
     **dict.fromkeys(("_episode_num", "_n_updates"), integer(0)),
     "_current_progress_remaining": number(),
 }
+_SPACES = ("observation_space", "action_space")
 # A replay buffer that keeps SB3 from allocating one.
 _NO_BUFFER: Any = object()
 
@@ -66,9 +45,9 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
             f"action_noise must be None for a safe bundle, got {model.action_noise}: set "
             "model.action_noise = None before saving, and set it again after loading"
         )
-    config, arrays = _describe(model, normalization_of(model, vec_normalize))
+    config, arrays = _describe(model, normalization.of_model(model, vec_normalize))
     _parse(type(model), config, arrays)  # raise now what loading would raise
-    write_container(path, {**config, "made_with": made_with()}, arrays)
+    container.write(path, {**config, "made_with": made_with()}, arrays)
     return path
 
 
@@ -84,9 +63,9 @@ def load_bundle(
         path = _with_suffix(path)
     device = get_device(device)
     with _refusing(path):
-        config, arrays = read_container(path)
+        config, arrays = container.read(path)
         attributes, state = _parse(cls, config, arrays)
-    normalization = attributes["normalization"]
+    statistics = attributes["normalization"]
     if env is not None:
         env = _wrapped(cls, env, attributes)
         attributes["normalization"] = None  # from now on the environment's
@@ -108,7 +87,7 @@ def load_bundle(
             training.load_optimizer(
                 f"optimizer.{name}", optimizer, config["optimizers"][name], arrays
             )
-        _check_content(config, arrays, *_describe(model, normalization))
+        _check_content(config, arrays, *_describe(model, statistics))
     return model
 
 
@@ -121,7 +100,7 @@ def made_with() -> dict[str, str]:
     }
 
 
-def _describe(model: Any, normalization: VecNormalize | None) -> tuple[dict[str, Any], Arrays]:
+def _describe(model: Any, statistics: VecNormalize | None) -> tuple[dict[str, Any], Arrays]:
     """Return the configuration and the arrays that say everything about a model."""
     arrays: Arrays = {
         f"policy.{name}": value.detach().cpu().numpy()
@@ -131,7 +110,7 @@ def _describe(model: Any, normalization: VecNormalize | None) -> tuple[dict[str,
     arrays[name] = ent_coef.detach().cpu().numpy()
     config: dict[str, Any] = {
         "format": FORMAT,
-        "policy": policy_to_spec(model),
+        "policy": policy.to_spec(model),
         "settings": {
             "learning_rate": training.rate_to_spec(model.learning_rate),
             **{
@@ -140,21 +119,21 @@ def _describe(model: Any, normalization: VecNormalize | None) -> tuple[dict[str,
             },
         },
         "replay_buffer": {
-            "class": name_of("replay_buffer_class", model.replay_buffer_class),
-            "kwargs": plain("replay_buffer_kwargs", model.replay_buffer_kwargs),
+            "class": policy.name_of("replay_buffer_class", model.replay_buffer_class),
+            "kwargs": policy.plain("replay_buffer_kwargs", model.replay_buffer_kwargs),
         },
         "progress": {name: check(name, getattr(model, name)) for name, check in _PROGRESS.items()},
         "optimizers": {
             name: training.optimizer_to_spec(f"optimizer.{name}", optimizer, arrays)
             for name, optimizer in model.optimizers().items()
         },
-        "normalization": normalization_to_spec(normalization, arrays),
+        "normalization": normalization.to_spec(statistics, arrays),
     }
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"model must be finite, got NaN or infinity in {name}")
-    for name in ("observation_space", "action_space"):
-        config[name] = space_to_spec(name, getattr(model, name), arrays)
+    for name in _SPACES:
+        config[name] = spaces.to_spec(name, getattr(model, name), arrays)
     return config, arrays
 
 
@@ -164,18 +143,15 @@ def _parse(
     """Return a model's attributes and its policy's parameters, validated before building it."""
     if config["format"] != FORMAT:
         raise ValueError(f"format must be {FORMAT}, got {config['format']}: is it a newer file?")
-    spaces = {
-        name: space_from_spec(name, config[name], arrays)
-        for name in ("observation_space", "action_space")
-    }
+    both = {name: spaces.from_spec(name, config[name], arrays) for name in _SPACES}
     buffer = config["replay_buffer"]
     attributes = {
-        **spaces,
+        **both,
         "learning_rate": training.rate_from_spec(config["settings"]["learning_rate"]),
-        "normalization": normalization_from_spec(config["normalization"], **spaces, arrays=arrays),
-        "replay_buffer_class": class_of("replay_buffer_class", buffer["class"]),
+        "normalization": normalization.from_spec(config["normalization"], **both, arrays=arrays),
+        "replay_buffer_class": policy.class_of("replay_buffer_class", buffer["class"]),
         "replay_buffer_kwargs": dict(buffer["kwargs"]),
-        **policy_from_spec(config["policy"]),
+        **policy.from_spec(config["policy"]),
     }
     for name, check in cls.settings.items():
         value = config["settings"][name]
@@ -184,7 +160,7 @@ def _parse(
     number()("target_entropy", attributes["target_entropy"])  # "auto" for new models only
     for name, check in _PROGRESS.items():
         attributes[name] = check(name, config["progress"][name])
-    expected = expected_parameters(attributes, len(arrays))
+    expected = policy.expected_parameters(attributes, len(arrays))
     state = {name: tensor_like(value, f"policy.{name}", arrays) for name, value in expected.items()}
     return attributes, state
 
@@ -194,7 +170,8 @@ def _check_content(
 ) -> None:
     """Check that a model holds everything in the file, and nothing was converted or left out."""
     keys = sorted((config.keys() | again.keys()) - {"made_with"})
-    differing = [key for key in keys if canonical(config.get(key)) != canonical(again.get(key))]
+    texts = [{key: container.canonical(one.get(key)) for key in keys} for one in (config, again)]
+    differing = [key for key in keys if texts[0][key] != texts[1][key]]
     differing += sorted(arrays.keys() ^ values.keys())
     for name in arrays.keys() & values.keys():
         found, expected = arrays[name], values[name]
@@ -217,15 +194,15 @@ def _refusing(path: Path) -> Iterator[None]:
 
 def _wrapped(cls: type[SAC], env: Any, attributes: dict[str, Any]) -> VecEnv:
     """Wrap the environment with the statistics that the model was trained with."""
-    normalization = attributes["normalization"]
-    if normalization is not None and isinstance(env, VecEnv) and unwrap_vec_normalize(env):
+    statistics = attributes["normalization"]
+    if statistics is not None and isinstance(env, VecEnv) and unwrap_vec_normalize(env):
         raise ValueError(
             "env must come without VecNormalize: load_safe wraps it with the statistics of the "
             "bundle"
         )
     venv = cls._wrap_env(maybe_make_env(env, 0))
     check_for_correct_spaces(venv, attributes["observation_space"], attributes["action_space"])
-    return venv if normalization is None else wrap_env(normalization, venv)
+    return venv if statistics is None else normalization.wrap(statistics, venv)
 
 
 def _ent_coef(model: SAC) -> tuple[str, th.Tensor]:

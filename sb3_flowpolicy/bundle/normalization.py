@@ -42,7 +42,7 @@ class _Statistics(VecNormalize):
         return {name: value for name, value in vars(self).items() if name not in bound}
 
 
-def normalization_of(
+def of_model(
     model: OffPolicyAlgorithm, vec_normalize: VecNormalize | None = None
 ) -> VecNormalize | None:
     """Return the given statistics, those of a model's environment, those of its bundle, or None."""
@@ -50,7 +50,7 @@ def normalization_of(
     return live if live is not None else getattr(model, "normalization", None)
 
 
-def wrap_env(known: VecNormalize, env: VecEnv) -> VecNormalize:
+def wrap(known: VecNormalize, env: VecEnv) -> VecNormalize:
     """Wrap environments with a copy of statistics."""
     settings = {name: getattr(known, name) for name in (*_SETTINGS, "norm_obs_keys")}
     wrapped = VecNormalize(env, **settings)
@@ -66,7 +66,7 @@ def obs_statistics(known: VecNormalize | None) -> dict[str, RunningMeanStd]:
     return found if isinstance(found, dict) else {ONLY_KEY: found}
 
 
-def normalization_to_spec(known: VecNormalize | None, arrays: Arrays) -> dict[str, Any] | None:
+def to_spec(known: VecNormalize | None, arrays: Arrays) -> dict[str, Any] | None:
     """Describe statistics, and put them into ``arrays``."""
     if known is None:
         return None
@@ -81,10 +81,10 @@ def normalization_to_spec(known: VecNormalize | None, arrays: Arrays) -> dict[st
     return {**plain, "keys": list(statistics)}
 
 
-def normalization_from_spec(
+def from_spec(
     spec: Any, observation_space: spaces.Space, action_space: spaces.Space, arrays: Arrays
 ) -> VecNormalize | None:
-    """Build the statistics that :func:`normalization_to_spec` described, if any."""
+    """Build the statistics that :func:`to_spec` described, if any."""
     if spec is None:
         return None
     given = {name: math.inf if spec[name] == "inf" else spec[name] for name in _SETTINGS}

@@ -60,7 +60,7 @@ def class_of(argument: str, name: str) -> Any:
     return _CLASSES[argument][name]
 
 
-def policy_to_spec(model: SAC) -> dict[str, Any]:
+def to_spec(model: SAC) -> dict[str, Any]:
     """Describe the class and the arguments of a model's policy."""
     spec = {"policy_class": name_of("policy_class", model.policy_class)}
     policy: Any = model.policy
@@ -69,8 +69,8 @@ def policy_to_spec(model: SAC) -> dict[str, Any]:
     return spec
 
 
-def policy_from_spec(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the model's attributes that :func:`policy_to_spec` described."""
+def from_spec(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the model's attributes that :func:`to_spec` described."""
     kwargs = {
         name: class_of(name, value) if name in _CLASSES else value for name, value in spec.items()
     }

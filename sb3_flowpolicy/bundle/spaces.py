@@ -9,18 +9,18 @@ from gymnasium import spaces
 from sb3_flowpolicy.bundle.container import Arrays
 
 
-def space_to_spec(name: str, space: spaces.Space, arrays: Arrays) -> dict[str, Any]:
+def to_spec(name: str, space: spaces.Space, arrays: Arrays) -> dict[str, Any]:
     """Describe a space, and put the bounds of boxes into ``arrays``.
 
     Example:
         >>> arrays = {}
-        >>> space_to_spec("action_space", spaces.Box(-1, 1, (2,)), arrays), list(arrays)
+        >>> to_spec("action_space", spaces.Box(-1, 1, (2,)), arrays), list(arrays)
         ({'type': 'Box'}, ['action_space.low', 'action_space.high'])
     """
     if isinstance(space, spaces.Dict):
         parts = enumerate(space.spaces.items())
         # Pairs, because JSON objects have no order.
-        entries = [[key, space_to_spec(f"{name}.{i}", part, arrays)] for i, (key, part) in parts]
+        entries = [[key, to_spec(f"{name}.{i}", part, arrays)] for i, (key, part) in parts]
         return {"type": "Dict", "spaces": entries}
     if not isinstance(space, spaces.Box):
         raise ValueError(
@@ -30,12 +30,12 @@ def space_to_spec(name: str, space: spaces.Space, arrays: Arrays) -> dict[str, A
     return {"type": "Box"}
 
 
-def space_from_spec(name: str, spec: dict[str, Any], arrays: Arrays) -> spaces.Space:
-    """Build the space that :func:`space_to_spec` described."""
+def from_spec(name: str, spec: dict[str, Any], arrays: Arrays) -> spaces.Space:
+    """Build the space that :func:`to_spec` described."""
     if spec["type"] == "Dict":
         parts = enumerate(spec["spaces"])
         return spaces.Dict(
-            {key: space_from_spec(f"{name}.{i}", part, arrays) for i, (key, part) in parts}
+            {key: from_spec(f"{name}.{i}", part, arrays) for i, (key, part) in parts}
         )
     if spec["type"] != "Box":
         raise ValueError(f"{name} must be a Box or a Dict, got {spec}")

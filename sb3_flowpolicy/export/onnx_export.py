@@ -16,8 +16,8 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_flowpolicy.bundle import normalization
 from sb3_flowpolicy.bundle.model import made_with
-from sb3_flowpolicy.bundle.normalization import normalization_of
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.export.deployed import DeployedPolicy, expected_actions, random_inputs
 from sb3_flowpolicy.policies import FlowActor
@@ -79,13 +79,13 @@ def export_onnx(
             f"use_sde=False, got {type(policy).__name__} with deterministic_mode={mode!r} and an "
             f"actor of type {type(actor).__name__}"
         )
-    normalization = normalization_of(model, vec_normalize)
-    deployed = DeployedPolicy(policy, normalization, stochastic).cpu().eval()
+    statistics = normalization.of_model(model, vec_normalize)
+    deployed = DeployedPolicy(policy, statistics, stochastic).cpu().eval()
     inputs = random_inputs(policy, stochastic, _N_CHECKED, np.random.default_rng(0))
     proto = _translate(deployed, [th.from_numpy(array[:2]) for array in inputs])
-    _add_metadata(proto, model, normalization is not None, stochastic)
+    _add_metadata(proto, model, statistics is not None, stochastic)
     content = proto.SerializeToString()
-    _check(content, deployed, inputs, expected_actions(policy, normalization, stochastic, inputs))
+    _check(content, deployed, inputs, expected_actions(policy, statistics, stochastic, inputs))
     path = Path(path)
     path = path if path.suffix else path.with_suffix(".onnx")
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,12 +15,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.bundle.container import (
-    canonical,
-    checksum,
-    read_container,
-    write_container,
-)
+from sb3_flowpolicy.bundle import container
+from sb3_flowpolicy.bundle.container import canonical, checksum
 
 FAST: dict[str, Any] = {
     "learning_starts": 10,
@@ -89,7 +85,7 @@ def assembled(header: dict[str, Any], data: bytes) -> bytes:
 
 def content_of(path: Path) -> tuple[str, dict[str, tuple]]:
     """Return what a bundle holds, apart from the versions that it was made with."""
-    config, arrays = read_container(path)
+    config, arrays = container.read(path)
     config.pop("made_with", None)
     values = {name: (one.dtype, one.shape, one.tobytes()) for name, one in arrays.items()}
     return canonical(config), values
@@ -100,10 +96,10 @@ def tampered(bundle: Path, tmp_path: Path) -> Callable[[Callable[[Any, dict], No
     """Return a function that writes a bundle whose configuration or arrays were changed."""
 
     def tamper(change: Callable[[Any, dict], None]) -> Path:
-        config, arrays = read_container(bundle)
+        config, arrays = container.read(bundle)
         change(config, arrays)
         path = tmp_path / "tampered.safetensors"
-        write_container(path, config, arrays)
+        container.write(path, config, arrays)
         return path
 
     return tamper
