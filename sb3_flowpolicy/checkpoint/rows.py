@@ -59,13 +59,8 @@ class RowFiles:
     def write(self, ring: Ring, steps: int, prefix: Path) -> list[dict[str, Any]]:
         """Write the rows that were added since :meth:`note`.
 
-        Args:
-            ring: The ring as it is now.
-            steps: Rows added in the life of the agent.
-            prefix: Path and first part of the names of new files.
-
-        Returns:
-            The files, earlier ones included, that hold all rows now.
+        ``prefix`` is the path and the first part of the names of new files. Returns the files,
+        earlier ones included, that hold all rows now.
         """
         width = sum(column[0].nbytes for column in ring.columns.values())
         length = max(1, _FILE_BYTES // width)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -36,7 +35,7 @@ class RunCheckpoints:
 
     def __init__(self, describe: Callable[[], Run]) -> None:
         self._describe = describe
-        #: Folder of the checkpoints, None until some are requested.
+        #: Folder to write to, None until checkpoints are requested.
         self.path: Path | None = None
         #: Whether checkpoints are being written.
         self.active = False
@@ -61,15 +60,8 @@ class RunCheckpoints:
     def learning(self, path: str | Path | None, every: int | None) -> Iterator[None]:
         """Write checkpoints during a call of ``learn``, and a last one at its end.
 
-        SIGTERM and Ctrl-C write a checkpoint, then take effect.
-
-        Args:
-            path: Folder for them.
-            every: Environment steps between two of them. With both None, none are written.
-
-        Raises:
-            ValueError: If ``every`` is below 1 or only one of the two is given, or the folder holds
-                another run's checkpoints.
+        SIGTERM and Ctrl-C write a checkpoint, then take effect. With both arguments None, nothing
+        is written.
         """
         if (path is None) != (every is None):
             raise ValueError(
@@ -135,11 +127,8 @@ class RunCheckpoints:
     def between_rollouts(self, callbacks: Mapping[str, BaseCallback]) -> bool:
         """Restore what waits for this moment, and write a checkpoint if one is due.
 
-        Args:
-            callbacks: The callback of each agent's ``learn``.
-
-        Returns:
-            Whether to go on: False after SIGTERM and Ctrl-C.
+        ``callbacks`` are those of the agents' ``learn``. Returns whether to go on: False after
+        SIGTERM and Ctrl-C.
         """
         if self._late is not None:
             run = self._run(callbacks)
@@ -162,11 +151,7 @@ class RunCheckpoints:
         return not stop
 
     def load(self, checkpoint: Checkpoint) -> None:
-        """Restore a checkpoint's state in agents that have been loaded.
-
-        Raises:
-            ValueError: If environments are not built as they were.
-        """
+        """Restore a checkpoint's state in agents that have been loaded."""
         run, manifest = self._run(), checkpoint.manifest
         for name, env in run.environments.items():
             check_same_build(env, manifest["layers"][name])
@@ -224,10 +209,6 @@ class RunCheckpoints:
             "agents": list(run.agents),
             "layers": {name: list(layers(env)) for name, env in run.environments.items()},
             "begun": run.first._num_timesteps_at_start,
-            "versions": {
-                "torch": th.__version__,
-                "stable_baselines3": stable_baselines3.__version__,
-            },
         }
         checkpoint = self._store.write(now, facts, write_files)
         if ring is not None:
@@ -236,11 +217,7 @@ class RunCheckpoints:
 
 
 def open_checkpoint(path: str | Path, kind: str) -> Checkpoint:
-    """Find the newest undamaged checkpoint of a folder.
-
-    Raises:
-        ValueError: If there is none, or it belongs to another class than ``kind``.
-    """
+    """Find the newest undamaged checkpoint of a folder; it must be of the class ``kind``."""
     checkpoint = CheckpointStore(path).newest()
     found = checkpoint.manifest["kind"]
     if found != kind:
@@ -255,11 +232,7 @@ def load_agent(
     env: Any,
     device: th.device | str = "auto",
 ) -> Any:
-    """Load an agent of a checkpoint.
-
-    Raises:
-        ValueError: If the environment is not built as it was, or has other spaces.
-    """
+    """Load an agent of a checkpoint, with an environment that is built as its own was."""
     check_same_build(env, checkpoint.manifest["layers"][name])
     path = checkpoint.folder / f"{name}.zip"
     return algorithm.load(path, env=env, device=device, force_reset=False)

@@ -25,12 +25,7 @@ _PARTIAL = ".partial"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A complete checkpoint.
-
-    Args:
-        folder: Where its files are.
-        manifest: Its description: ``kind``, ``num_timesteps``, ``segments``, ...
-    """
+    """A complete checkpoint: its folder, and ``kind``, ``num_timesteps``, ``segments``, ..."""
 
     folder: Path
     manifest: dict[str, Any]
@@ -48,9 +43,8 @@ class CheckpointStore:
     before are written and synchronized under other names first; renaming the folder completes it. A
     manifest lists the SHA-256 of every file, those of earlier rows included.
 
-    Args:
-        path: The folder; made when the first checkpoint is written.
-        good: Checkpoints in it to keep, oldest first.
+    The folder is made when the first checkpoint is written. ``good`` are those in it that are known
+    to be undamaged, oldest first.
     """
 
     def __init__(self, path: str | Path, good: Sequence[Checkpoint] = ()) -> None:
@@ -63,11 +57,7 @@ class CheckpointStore:
         return sorted((one for one in found if _NAME.fullmatch(one.name)), key=_number)
 
     def newest(self) -> Checkpoint:
-        """Return the newest checkpoint that is undamaged.
-
-        Raises:
-            ValueError: If there is none, or it was written in a later format.
-        """
+        """Return the newest checkpoint that is undamaged; ``ValueError`` if there is none."""
         checkpoint, damages = self._search()
         damaged = "; ".join(damages)
         if checkpoint is None:
@@ -107,9 +97,6 @@ class CheckpointStore:
             facts: What the manifest says.
             write_files: Function of the checkpoint's folder and of a prefix for files of new rows;
                 writes files and returns more facts, among them the ``segments`` that hold the rows.
-
-        Returns:
-            The checkpoint.
         """
         number = max(map(_number, self.folders()), default=0) + 1
         name = f"{number:05d}-step-{num_timesteps}"

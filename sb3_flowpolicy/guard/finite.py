@@ -68,18 +68,7 @@ def check_step(
     infos: Sequence[Mapping[str, Any]],
     step: int,
 ) -> None:
-    """Reject the result of a step of an SB3 ``VecEnv`` if any of it is not finite.
-
-    Args:
-        observations: Observations, the first of the next episode where one ended.
-        rewards: Rewards, (N,).
-        dones: Which episodes ended, (N,).
-        infos: Infos, with a ``terminal_observation`` where one ended.
-        step: Environment steps done, for the message.
-
-    Raises:
-        NonFiniteError: As :func:`check_experience`.
-    """
+    """Reject the result of a step of an SB3 ``VecEnv``, as :func:`check_experience` does."""
     check_experience({"observations": observations, "rewards": rewards}, step)
     for index, done in enumerate(dones):
         if done and infos[index].get("terminal_observation") is not None:
