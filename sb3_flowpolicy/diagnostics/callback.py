@@ -46,23 +46,12 @@ _TEXT_FORMATS = ("stdout", "log", "json", "csv")
 
 
 class PolicyDiagnosticsCallback(BaseCallback):
-    r"""Log entropy, standard deviation, correlation and value of the policy's actions.
+    """Log entropy, standard deviation, correlation and value of the policy's actions.
 
     Measured at states of the replay buffer. The callback does not consume the run's random
     numbers, so a run is the same with and without it. Its dashboard on TensorBoard's custom-scalars
-    page also shows the return and success rate that SB3 and ``EvalCallback`` log.
-
-    ====================================  ======================================================
-    key                                   meaning
-    ====================================  ======================================================
-    ``policy/entropy``                    entropy of the squashed policy, nats
-    ``policy/scale_i``                    standard deviation of action i, given the state
-    ``policy/mean_abs_correlation``       mean of \|correlation\| over pairs of actions
-    ``policy/correlation``                mean of \|correlation\| per pair, picture
-    ``policy/samples``                    action samples at four states, picture (D = 2)
-    ``value/q_policy``                    mean Q of the policy's own actions, all critics
-    ``value/q_buffer``                    mean Q of the actions in the replay buffer
-    ====================================  ======================================================
+    page also shows the return and success rate that SB3 and ``EvalCallback`` log. The TensorBoard
+    guide lists the keys.
 
     Args:
         log_freq: Environment steps between two measurements, at least 1.

@@ -21,9 +21,8 @@ from sb3_flowpolicy.policies import FlowActor
 
 def settings_key(model: Any) -> tuple[object, ...]:
     """Return all constants of an update, for a quick comparison."""
-    groups = [model.actor.optimizer.param_groups[0], model.critic.optimizer.param_groups[0]]
-    if model.ent_coef_optimizer is not None:
-        groups.append(model.ent_coef_optimizer.param_groups[0])
+    optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
+    groups = [optimizer.param_groups[0] for optimizer in optimizers if optimizer is not None]
     names = ("betas", "eps", "weight_decay", "amsgrad", "maximize")
     adam = [group.get(name) for group in groups for name in names]
     objective = model.objective()
@@ -63,7 +62,6 @@ class Engine(BoundEngine):
             self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)
             self.parts += [self.log_ent_coef, self.ent_coef_adam]
         settings = UpdateSettings(
-            objective=self.objective,
             tau=first.tau,
             target_entropy=float(first.target_entropy),
             actor_adam=self.actor_adam.settings,
@@ -174,23 +172,26 @@ class Engine(BoundEngine):
     def _fixed_ent_coefs(self) -> list[th.Tensor]:
         return [] if self.log_ent_coef else [model.ent_coef_tensor for model in self.models]
 
+    def state(self) -> TrainState:
+        """Return what an update of all seeds changes."""
+        if self.log_ent_coef is not None:
+            ent_coef = self.log_ent_coef.data
+        else:
+            ent_coef = th.stack([tensor.reshape(1) for tensor in self._fixed_ent_coefs()])
+        return TrainState(
+            self.networks.actor.data,
+            self.networks.critic.data,
+            tuple(part.data for part in self.networks.others),
+            ent_coef,
+            self.actor_adam.moments,
+            self.critic_adam.moments,
+            None if self.ent_coef_adam is None else self.ent_coef_adam.moments,
+        )
+
     def _groups(self, batch_size: int) -> list[tuple[slice, TrainState]]:
         """Return the seeds that are updated together, and what an update of them changes."""
         if self._grouped is None or self._grouped[0] != batch_size:
-            if self.log_ent_coef is not None:
-                ent_coef = self.log_ent_coef.data
-            else:
-                ent_coef = th.stack([tensor.reshape(1) for tensor in self._fixed_ent_coefs()])
-            state = TrainState(
-                self.networks.actor.data,
-                self.networks.critic.data,
-                tuple(part.data for part in self.networks.others),
-                ent_coef,
-                self.actor_adam.moments,
-                self.critic_adam.moments,
-                None if self.ent_coef_adam is None else self.ent_coef_adam.moments,
-            )
-            count = len(self.models)
+            state, count = self.state(), len(self.models)
             size = seeds_at_once(self.models[0].critic, count, batch_size)
             slices = [slice(start, start + size) for start in range(0, count, size)]
             groups = [(seeds, state if size == count else state.of(seeds)) for seeds in slices]
@@ -201,7 +202,7 @@ class Engine(BoundEngine):
         """Draw minibatches and noise for ``n_updates`` updates at once."""
         shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
         data = self.networks.actor.data
-        buffers = [model.replay_buffer for model in self.models if model.replay_buffer is not None]
+        buffers = [model.replay_buffer for model in self.models]
         if all(map(_can_be_rows, self.models)):
             if self._rows is None or not self._rows.holds(buffers):
                 self._rows = ReplayRows(buffers)
@@ -227,9 +228,9 @@ class Engine(BoundEngine):
             Losses, means over the updates, (4, S); see ``LOSSES``.
         """
         first = self.models[0]
-        optimizers = [first.actor.optimizer, first.critic.optimizer]
         # A fixed entropy coefficient takes no steps.
-        optimizers.append(first.ent_coef_optimizer or first.actor.optimizer)
+        third = first.ent_coef_optimizer or first.actor.optimizer
+        optimizers = (first.actor.optimizer, first.critic.optimizer, third)
         rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
         if self._learning_rates is None or self._learning_rates[0] != rates:
             device = self.networks.actor.data.device
@@ -239,15 +240,12 @@ class Engine(BoundEngine):
         history = self.history = []
         flags = [self.objective.is_due(first, k, start) for k in range(len(batches))]
         for batch, flag in zip(batches, flags, strict=True):
-            if len(groups) == 1:
-                state = groups[0][1]
-                history.append(self._update_once(state, batch, learning_rates, flag))
-                continue
+            parts = [batch] if len(groups) == 1 else [batch.of(seeds) for seeds, _ in groups]
             losses = [
-                self._update_once(part, batch.of(seeds), learning_rates, flag)
-                for seeds, part in groups
+                self._update_once(state, part, learning_rates, flag)
+                for (_, state), part in zip(groups, parts, strict=True)
             ]
-            history.append(th.cat(losses, dim=1))
+            history.append(losses[0] if len(losses) == 1 else th.cat(losses, dim=1))
         means, self.logged = self.objective.mean_losses(history, sum(flags))
         return means
 
@@ -263,9 +261,8 @@ class Engine(BoundEngine):
 def _can_be_rows(model: Any) -> bool:
     """Whether minibatches can be rows of floats; pixels would take four times the memory."""
     buffer = model.replay_buffer
-    if buffer is None or not is_plain(buffer) or model.get_vec_normalize_env() is not None:
-        return False
-    return buffer.observations.dtype.kind == "f"
+    fits = is_plain(buffer) and model.get_vec_normalize_env() is None
+    return fits and buffer.observations.dtype.kind == "f"
 
 
 def _places(model: Any) -> list[Place]:

@@ -17,16 +17,20 @@ from sb3_flowpolicy.policies import FlowActor
 Tensors = dict[str, th.Tensor]
 
 
-class _ActionLogProb(nn.Module):
-    """Samples and scores in ``forward``, which is what ``functional_call`` calls."""
+class AsForward(nn.Module):
+    """A function of a module as ``forward``, which is what ``functional_call`` calls.
 
-    def __init__(self, actor: FlowActor, observations: Observations) -> None:
+    The module's parameters have the prefix ``module.``.
+    """
+
+    def __init__(self, module: nn.Module, function: Callable[..., Any]) -> None:
         super().__init__()
-        self.actor = actor
-        self.observations = observations
+        self.module = module
+        self.function = function
 
-    def forward(self, obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return self.actor.action_log_prob(self.observations.unpack(obs), noise)
+    def forward(self, *arguments: Any) -> Any:
+        """Call the function."""
+        return self.function(*arguments)
 
 
 class StackedNetworks:
@@ -47,8 +51,8 @@ class StackedNetworks:
         self.others = self._others(policies)
         self.noise_dim = first.actor.density.noise_dim
         self.observations = Observations(first.observation_space)
-        self._sampler = _ActionLogProb(first.actor, self.observations)
-        self._critic = first.critic
+        self._sampler = AsForward(first.actor, self._action_log_prob)
+        self._actor, self._critic = first.actor, first.critic
 
     def _others(self, policies: Sequence[Any]) -> list[FlatParameters]:
         targets = [_critic_layout(policy.critic_target) for policy in policies]
@@ -65,6 +69,9 @@ class StackedNetworks:
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
             actions, log_prob = per_seed(self._sample_one, parameters, obs, noise)
         return actions.to(actor.dtype), log_prob.to(actor.dtype)
+
+    def _action_log_prob(self, obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return self._actor.action_log_prob(self.observations.unpack(obs), noise)
 
     def _sample_one(self, parameters: Tensors, obs: th.Tensor, noise: th.Tensor) -> Any:
         return functional_call(self._sampler, parameters, (obs, noise))
@@ -117,7 +124,7 @@ def per_seed(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _actor_layout(policy: Any) -> Layout:
-    return {f"actor.{name}": [value] for name, value in policy.actor.named_parameters()}
+    return {f"module.{name}": [value] for name, value in policy.actor.named_parameters()}
 
 
 def _critic_layout(critic: Any) -> Layout:

@@ -36,7 +36,7 @@ class PPOEngine(BoundEngine):
         policy = model.policy
         assert isinstance(policy, DensityActorCritic)
         self.model, self.policy, self.optimizer = model, policy, policy.optimizer
-        names = {f"policy.{name}": [value] for name, value in policy.named_parameters()}
+        names = {f"module.{name}": [value] for name, value in policy.named_parameters()}
         self.flat = FlatParameters([names])
         self.adam = FlatAdam(self.flat, [policy.optimizer])
         self.parts = [self.flat, self.adam]

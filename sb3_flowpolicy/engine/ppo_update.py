@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch as th
-from torch import nn
 from torch.func import functional_call
 from torch.nn.functional import mse_loss
 
 from sb3_flowpolicy.engine.adam import AdamSettings, Moments, adam_step
 from sb3_flowpolicy.engine.flat import FlatParameters
+from sb3_flowpolicy.engine.networks import AsForward
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic, bound_gradient
 
 
@@ -64,23 +64,11 @@ class PPOSettings:
 PPOUpdate = Callable[[PPOState, PPOBatch, th.Tensor], th.Tensor]
 
 
-class _Call(nn.Module):
-    """A method of a policy as ``forward``, which is what ``functional_call`` calls."""
-
-    def __init__(self, policy: DensityActorCritic, method: str) -> None:
-        super().__init__()
-        self.policy = policy
-        self.method = method
-
-    def forward(self, *arguments: th.Tensor | None) -> tuple[th.Tensor | None, ...]:
-        return getattr(self.policy, self.method)(*arguments)
-
-
 def policy_function(
     policy: DensityActorCritic, flat: FlatParameters, method: str
 ) -> Callable[..., tuple[th.Tensor, ...]]:
     """Return a method of the policy as a function of its flat parameters, (1, P), and arguments."""
-    module = _Call(policy, method)
+    module = AsForward(policy, getattr(policy, method))
 
     def call(parameters: th.Tensor, *arguments: th.Tensor | None) -> tuple[th.Tensor, ...]:
         named = {name: value.squeeze(0) for name, value in flat.unflatten(parameters).items()}

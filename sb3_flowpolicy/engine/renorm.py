@@ -13,7 +13,7 @@ from torch.func import functional_call
 from torch.nn.functional import linear
 
 from sb3_flowpolicy.engine.flat import FlatParameters
-from sb3_flowpolicy.engine.networks import StackedNetworks, Tensors, per_seed
+from sb3_flowpolicy.engine.networks import AsForward, StackedNetworks, Tensors, per_seed
 
 
 def renormalize(
@@ -58,17 +58,6 @@ def renormalize(
     return x, {name: value.squeeze(-2) for name, value in new.items()}
 
 
-class _Density(nn.Module):
-    """Samples and scores in ``forward``, which is what ``functional_call`` calls."""
-
-    def __init__(self, density: Any) -> None:
-        super().__init__()
-        self.density = density
-
-    def forward(self, context: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return self.density.rsample_and_log_prob(context, noise)
-
-
 class RenormNetworks(StackedNetworks):
     """Networks of CrossQ: instead of target networks they have running statistics.
 
@@ -80,7 +69,8 @@ class RenormNetworks(StackedNetworks):
     def _others(self, policies: Sequence[Any]) -> list[FlatParameters]:
         actors = [[policy.actor.latent_pi] for policy in policies]
         critics = [policy.critic.q_networks for policy in policies]
-        self._actor, self._density = policies[0].actor, _Density(policies[0].actor.density)
+        density = policies[0].actor.density
+        self._density = AsForward(density, density.rsample_and_log_prob)
         return [
             _buffers(actors, counts=False, copies=False),
             _buffers(critics, counts=False, copies=True),
@@ -125,7 +115,7 @@ class RenormNetworks(StackedNetworks):
         new: Tensors = {}
         hidden = actor.extract_features(self.observations.unpack(obs), actor.features_extractor)
         for name, layer in actor.latent_pi.named_children():
-            own = _of(f"actor.latent_pi.{name}.", parameters)
+            own = _of(f"module.latent_pi.{name}.", parameters)
             if isinstance(layer, BatchRenorm):
                 values = {**own, **_of(f"{name}.", statistics), "steps": steps}
                 hidden, found = renormalize(layer, hidden, values, training)
@@ -134,7 +124,7 @@ class RenormNetworks(StackedNetworks):
                 hidden = linear(hidden, own["weight"], own["bias"])
             else:
                 hidden = layer(hidden)
-        density = {f"density.{k}": v for k, v in _of("actor.density.", parameters).items()}
+        density = {f"module.{k}": v for k, v in _of("module.density.", parameters).items()}
         actions, log_prob = functional_call(self._density, density, (hidden, noise))
         return actions, log_prob, new
 

@@ -45,7 +45,11 @@ class ReplayRows:
         shape = (first.buffer_size, self.n_envs * len(buffers), sum(self.widths))
         # Pages take no memory until they are written to.
         rows = np.zeros(shape, np.float32)
-        self.columns = dict(zip(COLUMNS, self._views(rows, samples), strict=True))
+        parts = np.split(rows, np.cumsum(self.widths)[:-1], axis=-1)
+        self.columns = {
+            name: part.reshape(*part.shape[:2], *sample.shape[2:])
+            for name, part, sample in zip(COLUMNS, parts, samples, strict=True)
+        }
         self._owned = []
         for index, buffer in enumerate(self.buffers):
             own = slice(index * self.n_envs, (index + 1) * self.n_envs)
@@ -56,13 +60,6 @@ class ReplayRows:
                 setattr(buffer, name, view)
                 self._owned.append((buffer, name, view))
         self._flat = th.from_numpy(rows).flatten(0, 1)
-
-    def _views(self, rows: np.ndarray, samples: Sequence[np.ndarray]) -> list[np.ndarray]:
-        parts = np.split(rows, np.cumsum(self.widths)[:-1], axis=-1)
-        return [
-            part.reshape(*part.shape[:2], *sample.shape[2:])
-            for part, sample in zip(parts, samples, strict=True)
-        ]
 
     def holds(self, buffers: Sequence[ReplayBuffer]) -> bool:
         """Whether these still are the buffers, and their arrays still views."""

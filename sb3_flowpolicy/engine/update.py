@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -60,6 +60,71 @@ LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 """What SB3 logs of an update: the rows of the tensor (4, S) that an update returns."""
 
 
+@dataclass(frozen=True)
+class UpdateSettings:
+    """Constants of an update: they are compiled into it."""
+
+    tau: float
+    target_entropy: float
+    actor_adam: AdamSettings
+    critic_adam: AdamSettings
+    ent_coef_adam: AdamSettings | None  # None: the entropy coefficient is fixed
+
+
+# (state, batch, learning rates of actor, critics and entropy coefficient, flag of
+# Objective.is_due) -> losses, (4, S)
+Update = Callable[[TrainState, Batch, th.Tensor, bool], th.Tensor]
+
+
+def entropy_coefficient(state: TrainState, settings: UpdateSettings) -> th.Tensor:
+    """Return the entropy coefficient, (S, 1)."""
+    return state.ent_coef if settings.ent_coef_adam is None else state.ent_coef.exp()
+
+
+def step_entropy_coefficient(
+    state: TrainState, log_prob: th.Tensor, learning_rate: th.Tensor, settings: UpdateSettings
+) -> th.Tensor:
+    """Update the entropy coefficient in place, if it is learned, and return its loss, (S, 1)."""
+    moments = state.ent_coef_moments
+    if settings.ent_coef_adam is None or moments is None:
+        return th.zeros_like(state.ent_coef)
+    # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
+    surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
+    loss = -(state.ent_coef * surplus)
+    step(state.ent_coef, -surplus, moments, learning_rate, settings.ent_coef_adam)
+    return loss
+
+
+def bellman_targets(batch: Batch, next_values: th.Tensor, entropy: th.Tensor) -> th.Tensor:
+    """Return r + gamma (1 - d) (V' - entropy), (S, B, T), for values (S, B, T)."""
+    discounts = (1 - batch.dones) * batch.discounts
+    next_values = next_values - entropy.unsqueeze(-1)
+    return batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
+
+
+def step(
+    parameters: th.Tensor,
+    gradient: th.Tensor,
+    moments: Moments,
+    learning_rate: th.Tensor,
+    settings: AdamSettings,
+) -> None:
+    """Take a step of Adam in place."""
+    stepped = adam_step(parameters, gradient, moments, learning_rate, settings)
+    for old, new in zip((parameters, *moments), stepped, strict=True):
+        old.copy_(new)
+
+
+def gradient_of(loss: th.Tensor, leaf: th.Tensor) -> th.Tensor:
+    """Differentiate losses (S,). As seeds share no parameters, that of the sum is each one's."""
+    return th.autograd.grad(loss.sum(), leaf)[0]
+
+
+def stack_losses(*losses: th.Tensor) -> th.Tensor:
+    """Return the losses (S,) or (S, 1), in the order of ``LOSSES``, as (4, S)."""
+    return th.stack([loss.detach().flatten() for loss in losses])
+
+
 class Objective(ABC):
     """What an algorithm makes of the critics' outputs, (S, C, B, Q): Q numbers per row and critic.
 
@@ -110,132 +175,53 @@ class Objective(ABC):
         return history[0] if len(history) == 1 else th.stack(list(history)).mean(0), LOSSES
 
     def make_update(self, networks: Any, settings: UpdateSettings) -> Update:
-        """Return the function that performs one update, see :func:`make_update`."""
-        return make_update(networks, settings)
+        r"""Return the function that performs one update of all seeds, in place.
 
+        It is the ``train`` of SB3's SAC and sb3-contrib's TQC, in their order: entropy coefficient,
+        critics, actor, target networks. The objective says what V', L_Q and V are.
 
-@dataclass(frozen=True)
-class UpdateSettings:
-    """Constants of an update: they are compiled into it."""
+        .. math::
+            y &= r + \gamma (1 - d) (V'(Q^{target}(s', a')) - \alpha \log \pi(a' | s')) \\
+            L_Q &= L_Q(Q(s, a), y) \\
+            L_\pi &= \mathrm{mean} (\alpha \log \pi(\tilde a | s) - V(Q(s, \tilde a)))
 
-    objective: Objective
-    tau: float
-    target_entropy: float
-    actor_adam: AdamSettings
-    critic_adam: AdamSettings
-    ent_coef_adam: AdamSettings | None  # None: the entropy coefficient is fixed
+        References:
+            Thesis Algorithm 2.
+        """
 
+        def update(
+            state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
+        ) -> th.Tensor:
+            (target,) = state.others
+            actor = state.actor.detach().requires_grad_()
+            actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
 
-# (state, batch, learning rates, flag of Objective.is_due) -> losses, (4, S)
-Update = Callable[[TrainState, Batch, th.Tensor, bool], th.Tensor]
+            # As in SB3, this update uses the coefficient before its own step.
+            ent_coef = entropy_coefficient(state, settings)
+            ent_coef_loss = step_entropy_coefficient(state, log_prob, learning_rates[2], settings)
 
+            with th.no_grad():
+                next_actions, next_log_prob = networks.sample(
+                    state.actor, batch.next_obs, batch.noise[1]
+                )
+                outputs = networks.q_values(target, batch.next_obs, next_actions)
+                targets = bellman_targets(
+                    batch, self.next_values(outputs), ent_coef * next_log_prob
+                )
 
-def entropy_coefficient(state: TrainState, settings: UpdateSettings) -> th.Tensor:
-    """Return the entropy coefficient, (S, 1)."""
-    return state.ent_coef if settings.ent_coef_adam is None else state.ent_coef.exp()
+            critic = state.critic.detach().requires_grad_()
+            outputs = networks.q_values(critic, batch.obs, batch.actions)
+            critic_loss = self.critic_loss(outputs, targets)
+            gradient, moments = gradient_of(critic_loss, critic), state.critic_moments
+            step(state.critic, gradient, moments, learning_rates[1], settings.critic_adam)
 
+            outputs = networks.q_values(state.critic, batch.obs, actions_pi)
+            actor_loss = (ent_coef * log_prob - self.actor_values(outputs)).mean(-1)
+            gradient, moments = gradient_of(actor_loss, actor), state.actor_moments
+            step(state.actor, gradient, moments, learning_rates[0], settings.actor_adam)
 
-def step_entropy_coefficient(
-    state: TrainState, log_prob: th.Tensor, learning_rate: th.Tensor, settings: UpdateSettings
-) -> th.Tensor:
-    """Update the entropy coefficient in place, if it is learned, and return its loss, (S, 1)."""
-    moments = state.ent_coef_moments
-    if settings.ent_coef_adam is None or moments is None:
-        return th.zeros_like(state.ent_coef)
-    # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
-    surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
-    loss = -(state.ent_coef * surplus)
-    step(state.ent_coef, -surplus, moments, learning_rate, settings.ent_coef_adam)
-    return loss
+            if move_target:
+                target.lerp_(state.critic, settings.tau)
+            return stack_losses(ent_coef, ent_coef_loss, critic_loss, actor_loss)
 
-
-def bellman_targets(batch: Batch, next_values: th.Tensor, entropy: th.Tensor) -> th.Tensor:
-    """Return r + gamma (1 - d) (V' - entropy), (S, B, T), for values (S, B, T)."""
-    discounts = (1 - batch.dones) * batch.discounts
-    next_values = next_values - entropy.unsqueeze(-1)
-    return batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
-
-
-def step(
-    parameters: th.Tensor,
-    gradient: th.Tensor,
-    moments: Moments,
-    learning_rate: th.Tensor,
-    settings: AdamSettings,
-) -> None:
-    """Take a step of Adam in place."""
-    stepped = adam_step(parameters, gradient, moments, learning_rate, settings)
-    write((parameters, *moments), stepped)
-
-
-def write(olds: Iterable[th.Tensor], news: Iterable[th.Tensor]) -> None:
-    """Overwrite tensors in place."""
-    for old, new in zip(olds, news, strict=True):
-        old.copy_(new)
-
-
-def gradient_of(loss: th.Tensor, leaf: th.Tensor) -> th.Tensor:
-    """Differentiate losses (S,). As seeds share no parameters, that of the sum is each one's."""
-    return th.autograd.grad(loss.sum(), leaf)[0]
-
-
-def stack_losses(*losses: th.Tensor) -> th.Tensor:
-    """Return the losses (S,) or (S, 1), in the order of ``LOSSES``, as (4, S)."""
-    return th.stack([loss.detach().flatten() for loss in losses])
-
-
-def make_update(networks: StackedNetworks, settings: UpdateSettings) -> Update:
-    r"""Return the function that performs one update of all seeds, in place.
-
-    It is the ``train`` of SB3's SAC and sb3-contrib's TQC, in their order: entropy coefficient,
-    critics, actor, target networks. The objective says what V', L_Q and V are.
-
-    .. math::
-        y &= r + \gamma (1 - d) (V'(Q^{target}(s', a')) - \alpha \log \pi(a' | s')) \\
-        L_Q &= L_Q(Q(s, a), y) \\
-        L_\pi &= \mathrm{mean} (\alpha \log \pi(\tilde a | s) - V(Q(s, \tilde a)))
-
-    It is a function of state, batch, learning rates (of actor, critics and entropy coefficient),
-    and whether to move the target networks, and returns the losses (4, S), see ``LOSSES``.
-
-    References:
-        Soft Actor-Critic Algorithms and Applications (Haarnoja et al., 2018); thesis Algorithm 2.
-    """
-    objective = settings.objective
-
-    def update(
-        state: TrainState, batch: Batch, learning_rates: th.Tensor, move_target: bool
-    ) -> th.Tensor:
-        (target,) = state.others
-        actor = state.actor.detach().requires_grad_()
-        actions_pi, log_prob = networks.sample(actor, batch.obs, batch.noise[0])
-
-        # As in SB3, this update uses the coefficient before its own step.
-        ent_coef = entropy_coefficient(state, settings)
-        ent_coef_loss = step_entropy_coefficient(state, log_prob, learning_rates[2], settings)
-
-        with th.no_grad():
-            next_actions, next_log_prob = networks.sample(
-                state.actor, batch.next_obs, batch.noise[1]
-            )
-            outputs = networks.q_values(target, batch.next_obs, next_actions)
-            targets = bellman_targets(
-                batch, objective.next_values(outputs), ent_coef * next_log_prob
-            )
-
-        critic = state.critic.detach().requires_grad_()
-        outputs = networks.q_values(critic, batch.obs, batch.actions)
-        critic_loss = objective.critic_loss(outputs, targets)
-        gradient, moments = gradient_of(critic_loss, critic), state.critic_moments
-        step(state.critic, gradient, moments, learning_rates[1], settings.critic_adam)
-
-        outputs = networks.q_values(state.critic, batch.obs, actions_pi)
-        actor_loss = (ent_coef * log_prob - objective.actor_values(outputs)).mean(-1)
-        gradient, moments = gradient_of(actor_loss, actor), state.actor_moments
-        step(state.actor, gradient, moments, learning_rates[0], settings.actor_adam)
-
-        if move_target:
-            target.lerp_(state.critic, settings.tau)
-        return stack_losses(ent_coef, ent_coef_loss, critic_loss, actor_loss)
-
-    return update
+        return update
