@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -9,16 +11,116 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flowpolicy.algorithms.noise_process import MAX_COLOR, NoiseProcess
 from sb3_flowpolicy.common.validation import Check, number, optional
 from sb3_flowpolicy.common.vec_env import BatchedVecEnv
 from sb3_flowpolicy.policies import FlowActor
 
+# Largest exponent of the spectrum.
+MAX_COLOR = 1.5
+DEFAULT_HORIZON = 1000
 SETTINGS: dict[str, Check] = {
     "action_noise_color": number(0, MAX_COLOR),
     "action_noise_correlation_time": optional(number(0, above=True)),
 }
 """Attributes of an agent, with their checks."""
+
+
+class NoiseProcess:
+    r"""A stationary Gaussian process per environment, with a spectrum like :math:`f^{-\beta}`.
+
+    Every value on its own is exactly standard normal, from the first step of an episode on. So at
+    a fixed state a density that is handed this noise has the distribution it always has, while
+    successive actions correlate: the agent moves somewhere instead of jittering in place.
+
+    The process is a weighted sum of first-order autoregressions with correlation times from half a
+    step to sixteen horizons. Unlike noise that is made in the frequency domain it needs no length
+    in advance, and its state is small.
+
+    Args:
+        noise_dim: Size M of the noise.
+        n_envs: Number of environments N.
+        color: Exponent :math:`\beta` of the spectrum, in [0, 1.5]: 0 is white, 1 pink.
+        correlation_time: Steps after which the autocorrelation has fallen to 1/e, above 0: an
+            Ornstein-Uhlenbeck process, instead of a color.
+        horizon: Steps of an episode, at least 2: the spectrum follows the power law for
+            frequencies from 1/horizon to 1/2 and is flat below.
+
+    References:
+        Pink Noise Is All You Need (Eberhard et al., 2023); thesis chapter 4 on Brownian motion as
+        what independent steps amount to.
+
+    Example:
+        >>> process = NoiseProcess(noise_dim=2, n_envs=3, color=1.0, horizon=40)
+        >>> process.step(th.randn(process.white_shape)).shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(
+        self,
+        noise_dim: int,
+        n_envs: int = 1,
+        color: float = 0.0,
+        correlation_time: float | None = None,
+        horizon: int | None = None,
+    ) -> None:
+        horizon = DEFAULT_HORIZON if horizon is None else horizon
+        #: What it was made of: two processes with the same settings have the same distribution.
+        self.settings = (noise_dim, n_envs, color, correlation_time, horizon)
+        if correlation_time is not None:
+            decays, shares = np.array([math.exp(-1 / correlation_time)]), np.ones(1)
+        elif color == 0:
+            decays, shares = np.zeros(1), np.ones(1)
+        else:
+            decays, shares = _fit(float(color), int(horizon))
+        self._decays = th.as_tensor(decays, dtype=th.float64).unsqueeze(-1)
+        self._weights = th.as_tensor(shares, dtype=th.float64).sqrt().unsqueeze(-1)
+        #: Shape (N, J, M) of the white noise that one step consumes.
+        self.white_shape = (n_envs, len(decays), noise_dim)
+        self._values = th.zeros(self.white_shape, dtype=th.float64)
+        self._starting = th.ones(n_envs, 1, 1, dtype=th.bool)
+
+    def step(self, white: th.Tensor) -> th.Tensor:
+        """Return standard normals (N, M) that correlate with those before.
+
+        They are made of independent ones, (N, J, M), see ``white_shape``.
+        """
+        # At the start of an episode there is no past: the first value is drawn afresh.
+        decays = th.where(self._starting, 0.0, self._decays)
+        self._values = decays * self._values + (1 - decays**2).sqrt() * white
+        self._starting.zero_()
+        return (self._weights * self._values).sum(1).to(white.dtype)
+
+    def restart(self, ended: np.ndarray | None = None) -> None:
+        """Forget the past where an episode ended, boolean (N,); default: everywhere."""
+        self._starting |= True if ended is None else th.as_tensor(ended).view(-1, 1, 1)
+
+    def state(self) -> dict[str, th.Tensor]:
+        """Return what is needed to continue the same process."""
+        return {"values": self._values.clone(), "starting": self._starting.clone()}
+
+    def set_state(self, state: dict[str, th.Tensor]) -> None:
+        """Restore what :meth:`state` returned."""
+        self._values, self._starting = state["values"].clone(), state["starting"].clone()
+
+
+@lru_cache(maxsize=8)
+def _fit(color: float, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return decays and shares of the variance, both (J,), whose spectrum follows the power law."""
+    frequencies = np.geomspace(1 / horizon, 0.5, 256)
+    times = np.geomspace(0.5, 16 * horizon, 2 + int(np.log2(32 * horizon)))
+    decays = np.concatenate([[0.0], np.exp(-1 / times)])
+    turns = np.cos(2 * np.pi * frequencies)[:, None]
+    spectra = (1 - decays**2) / (1 - 2 * decays * turns + decays**2)
+    # Errors count relative to the power law, so each row asks for one.
+    relative = spectra * frequencies[:, None] ** color
+    relative /= relative.mean()
+    # Least squares under non-negativity, by the multiplicative updates of Lee and Seung (2001).
+    shares = np.ones(len(decays))
+    gram, aim = relative.T @ relative, relative.sum(0)
+    for _ in range(5000):
+        shares *= aim / (gram @ shares)
+    kept = shares > 1e-3 * shares.sum()
+    return decays[kept], shares[kept] / shares[kept].sum()
 
 
 class ColoredExploration:

@@ -44,14 +44,11 @@ def evaluate_success(
 def episode_frames(
     model: BaseAlgorithm, env: VecEnv, n_samples: int = 300, deterministic: bool = False
 ) -> list[np.ndarray]:
-    """Play one episode and render it with the policy's action samples.
+    """Play one episode and render it with samples of the policy's actions.
 
-    Args:
-        model: Any SB3 model.
-        env: One vectorized environment with the render mode ``rgb_array`` and a method
-            ``set_action_samples``, as those of ``flowpolicy_envs`` have.
-        n_samples: Number of action samples drawn at each step, always with exploration.
-        deterministic: Whether to act without exploration.
+    ``env`` is one vectorized environment with the render mode ``rgb_array`` and a method
+    ``set_action_samples``, as those of ``flowpolicy_envs`` have. ``deterministic`` concerns the
+    actions that are taken; samples are always drawn with exploration.
 
     Returns:
         One picture (size, size, 3) per step, rendered before its action.
@@ -73,10 +70,7 @@ def episode_frames(
 def rollout_figure(
     model: BaseAlgorithm, env: VecEnv, n_panels: int = 4, n_samples: int = 300
 ) -> Figure:
-    """Draw the policy's action samples at states spread evenly over a deterministic episode.
-
-    The arguments are those of :func:`episode_frames`.
-    """
+    """Draw :func:`episode_frames` at steps spread evenly over a deterministic episode."""
     frames = episode_frames(model, env, n_samples, deterministic=True)
     steps = np.unique(np.linspace(0, len(frames) - 1, n_panels).round().astype(int))
     return _panels(frames, steps, 3.2, 3.4)

@@ -39,7 +39,7 @@ class Compiled:
         return self._compile(key, *arguments) if graph is None else graph(*arguments)
 
     def _compile(self, key: Hashable, *arguments: Any) -> Any:
-        _say(f"Compiling {self.name} ...")
+        print(f"Compiling {self.name} ...", file=sys.stderr, flush=True)
         start = time.perf_counter()
         # A function of its own per graph: dynamo keeps its graphs with a function's code.
         code = self.function.__code__.replace()
@@ -56,7 +56,8 @@ class Compiled:
                 result = graph(*arguments)
         except (th._dynamo.exc.TorchDynamoException, th._inductor.exc.InductorError) as error:
             return self._run_eagerly(error, *arguments)
-        _say(f"Compiled {self.name} in {time.perf_counter() - start:.0f} s")
+        seconds = time.perf_counter() - start
+        print(f"Compiled {self.name} in {seconds:.0f} s", file=sys.stderr, flush=True)
         self._graphs[key] = graph
         return result
 
@@ -84,8 +85,3 @@ def _options(device: th.device) -> dict[str, Any]:
         # Launching kernels from Python would cost more than running them.
         "triton.cudagraphs" if device.type == "cuda" else "cpp_wrapper": True,
     }
-
-
-def _say(text: str) -> None:
-    """Print to stderr, at any verbosity, and leave stdout to the program."""
-    print(text, file=sys.stderr, flush=True)

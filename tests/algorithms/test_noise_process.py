@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from scipy import signal, stats
 
-from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.algorithms.exploration import NoiseProcess
 
 
 def run(process: NoiseProcess, steps: int, seed: int = 0) -> np.ndarray:

@@ -17,7 +17,7 @@ from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.batch import METRICS, SquareBatch
 from flowpolicy_envs.square.config import SquareConfig
 from flowpolicy_envs.square.tasks import as_task
-from sb3_flowpolicy.algorithms.noise_process import NoiseProcess
+from sb3_flowpolicy.algorithms.exploration import NoiseProcess
 from sb3_flowpolicy.experiments.coordination.families import (
     FAMILIES,
     INDEPENDENT_START,
