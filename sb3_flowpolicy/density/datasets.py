@@ -162,8 +162,6 @@ def moon_log_density(points: np.ndarray) -> np.ndarray:
     .. math:: p(x) = \frac{1}{\pi} \int_0^\pi
         \mathcal N\bigl(x; (\cos t, \sin t), \sigma^2 I\bigr)\, dt
 
-    Shapes: points (N, 2) -> log p in nats (N,).
-
     Example:
         >>> on_the_arc, beside = moon_log_density(np.array([[0.0, 1.0], [0.0, 0.0]]))
         >>> bool(on_the_arc > 0 > beside)
@@ -194,9 +192,6 @@ def entropy_on_grid(
         low: Lower corner of a box around the data without the noise.
         high: Upper corner.
         noise: Standard deviation of the noise.
-
-    Raises:
-        ValueError: If the mass on the grid is not 1.
 
     Example:
         >>> normal = lambda x: -0.5 * (x**2).sum(1) - np.log(2 * np.pi)

@@ -204,13 +204,11 @@ def _animate(model: FlowModel, path: Path, scale: Scale) -> None:
 
 
 def _grid_of_panels(n_panels: int, n_columns: int, size: float = 2.1) -> tuple[Figure, list[Axes]]:
-    """Return a figure of square panels without ticks, filled row by row."""
-    n_rows = -(-n_panels // n_columns)
+    """Return a figure of full rows of square panels without ticks."""
+    n_rows = n_panels // n_columns
     figure = Figure(figsize=(size * n_columns, (size + 0.25) * n_rows), layout="constrained")
-    panels = [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_panels)]
-    for axes in panels:
-        axes.set(xticks=[], yticks=[], aspect="equal")
-    return figure, panels
+    bare = {"xticks": [], "yticks": [], "aspect": "equal"}
+    return figure, list(figure.subplots(n_rows, n_columns, squeeze=False, subplot_kw=bare).flat)
 
 
 def _draw_points(

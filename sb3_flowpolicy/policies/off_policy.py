@@ -34,9 +34,8 @@ class DistributionPolicy(DensityPolicy):
         **policy_kwargs: Arguments of the algorithm's own policy class.
 
     Raises:
-        ValueError: If the action space is not a bounded Box; if the density or the mode is unknown;
-            or if ``use_sde=True`` with any density but the diagonal normal distribution (whose
-            actor is then SB3's own).
+        ValueError: If the action space is not a bounded Box, or if ``use_sde=True`` with any
+            density but the diagonal normal distribution (whose actor is then SB3's own).
     """
 
     actor_class: ClassVar[type[FlowActor]] = FlowActor
