@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 # Fields above this share are so dark that their text has to be white.
 _DARK = 0.6
-PANELS = ("train_return", "test_return", "test_success", "entropy", "ent_coef")
+PANELS = ("train_return", "train_success", "test_return", "test_success", "entropy", "ent_coef")
 _WALL, _GOAL = "#d62728", "#78c878"
 _VIEW = 1.6
 """Half the edge of a view of the agent, in reaches."""
@@ -33,7 +33,7 @@ SMOOTHED_OVER = 3
 def panels(evidence: Evidence) -> list[str]:
     """Return the metrics to draw: those measured, and the entropy coefficient if learned."""
     measured = {(s.name, a.name): evidence.columns(s.name, a.name) for s, a in evidence.measured}
-    names = {name for columns in measured.values() for name in columns} - {"train_success"}
+    names = {name for columns in measured.values() for name in columns}
     if not any(
         np.ptp(evidence.curves(*pair, "ent_coef")) > 0
         for pair, columns in measured.items()
