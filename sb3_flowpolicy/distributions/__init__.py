@@ -1,4 +1,4 @@
-"""Action densities as pure functions of parameters, context and noise. Imports torch only."""
+"""Action densities as pure functions of parameters, context and noise, without SB3."""
 
 from sb3_flowpolicy.distributions.base import ActionDistribution
 from sb3_flowpolicy.distributions.full_covariance import FullCovarianceGaussian

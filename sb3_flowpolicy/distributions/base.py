@@ -85,7 +85,7 @@ class ActionDistribution(nn.Module, ABC):
         _check_last_dim("context", context, self.context_dim)
         return self._entropy(context)
 
-    def shrink_heads(self, gain: float = 0.01) -> None:
+    def shrink_heads(self) -> None:
         """Reinitialize such that the density hardly depends on the context: on-policy algorithms.
 
         Weights of the layers that read the context become orthogonal with a small gain, biases
@@ -94,7 +94,7 @@ class ActionDistribution(nn.Module, ABC):
         """
         for module in self.children():
             if isinstance(module, nn.Linear):
-                nn.init.orthogonal_(module.weight, gain)
+                nn.init.orthogonal_(module.weight, 0.01)
                 nn.init.zeros_(module.bias)
 
     def draw_noise(self, context: th.Tensor, *sample_shape: int) -> th.Tensor:

@@ -199,7 +199,7 @@ class CouplingFlow(ActionDistribution):
                 nn.init.zeros_(coupling.last.weight)
                 nn.init.zeros_(coupling.last.bias)
 
-    def shrink_heads(self, gain: float = 0.01) -> None:
+    def shrink_heads(self) -> None:
         """Do nothing: ``init`` says how the flow starts, by default as the identity."""
 
     def _through(

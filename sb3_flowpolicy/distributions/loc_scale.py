@@ -40,10 +40,10 @@ class LocScale(DiagGaussian):
         self.shape = shape
         self.noise_dim = shape.noise_dim
 
-    def shrink_heads(self, gain: float = 0.01) -> None:
+    def shrink_heads(self) -> None:
         """Shrink those of location, scale and shape."""
-        super().shrink_heads(gain)
-        self.shape.shrink_heads(gain)
+        super().shrink_heads()
+        self.shape.shrink_heads()
 
     def _rsample_and_log_prob(
         self, context: th.Tensor, noise: th.Tensor

@@ -23,7 +23,7 @@ class Compiled:
     def __init__(self, function: Callable[..., Any], name: str, device: th.device) -> None:
         self.function = function
         self.name = name
-        self.broken = False
+        self.eager = False
         self._device = device
         self._graphs: dict[Hashable, Callable[..., Any]] = {}
 
@@ -33,7 +33,7 @@ class Compiled:
 
     def __call__(self, key: Hashable, *arguments: Any) -> Any:
         """Call the function; ``key`` tells apart calls that need different graphs."""
-        if self.broken:
+        if self.eager:
             return self.function(*arguments)
         graph = self._graphs.get(key)
         return self._compile(key, *arguments) if graph is None else graph(*arguments)
@@ -62,7 +62,7 @@ class Compiled:
         return result
 
     def _run_eagerly(self, error: Exception, *arguments: Any) -> Any:
-        self.broken = True
+        self.eager = True
         warnings.warn(
             f"{self.name} could not be compiled and runs eagerly: the same numbers, only "
             f"slower ({type(error).__name__}: {str(error).strip().splitlines()[0]})",

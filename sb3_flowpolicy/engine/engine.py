@@ -92,7 +92,7 @@ class Engine(BoundEngine):
 
     @staticmethod
     def why_unsupported(model: Any) -> str | None:
-        """Return what about a model the engine does not support; None if it supports everything."""
+        """Return which part of a model the engine does not support, or None."""
         policy, objective = model.policy, model.objective()
         if objective is None:
             return f"the update of {type(model).__name__}"
@@ -117,8 +117,8 @@ class Engine(BoundEngine):
 
     def _runs_compiled(self) -> bool:
         """Whether to call compiled functions: not after one could not be compiled."""
-        broken = self._compiled_update.broken or self._compiled_sample.broken
-        return self.compiled and not broken
+        eager = self._compiled_update.eager or self._compiled_sample.eager
+        return self.compiled and not eager
 
     def fits(self) -> bool:
         """Whether the models have the same networks, optimizers and constants as at the start."""

@@ -53,11 +53,11 @@ class PPOEngine(BoundEngine):
         self._update = Compiled(self._eager_update, "the PPO update", device)
         act = policy_function(policy, self.flat, "sample_and_score")
         self._act = Compiled(act, "the policy", device)
-        self._update.broken = self._act.broken = not compiled
+        self._update.eager = self._act.eager = not compiled
 
     @staticmethod
     def why_unsupported(model: PPO) -> str | None:
-        """Return what about a model the engine does not support; None if it supports everything."""
+        """Return which part of a model the engine does not support, or None."""
         if not isinstance(model.policy, DensityActorCritic):
             return f"policy of type {type(model.policy).__name__}"
         if type(model.rollout_buffer) is not RolloutBuffer:

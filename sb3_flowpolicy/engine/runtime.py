@@ -44,7 +44,7 @@ class BoundEngine(ABC):
     @staticmethod
     @abstractmethod
     def why_unsupported(model: Any) -> str | None:
-        """Return what about a model the engine does not support; None if it supports everything."""
+        """Return which part of a model the engine does not support, or None."""
 
     @abstractmethod
     def fits(self) -> bool:

@@ -153,7 +153,7 @@ class Objective(ABC):
         """Return the values (S, B) that the actor maximizes."""
 
     def why_unsupported(self, policy: Any) -> str | None:
-        """Return what about a policy is not supported, besides what no algorithm supports."""
+        """Return which part of a policy the algorithm, unlike others, does not support, or None."""
         return None
 
     def layer_constants(self, policy: Any) -> tuple[object, ...]:

@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import (
 )
 
 from sb3_flowpolicy.common.validation import layer_sizes, mapping, optional
-from sb3_flowpolicy.guard.finite import all_finite, check_observation
+from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite, check_observation
 
 _FORMS = {"Cnn": ("image", NatureCNN), "MultiInput": ("dictionary", CombinedExtractor)}
 
@@ -55,7 +55,7 @@ class DensityPolicy(BasePolicy):
         """Choose actions, as SB3's policies do.
 
         Raises:
-            ValueError: If an observation or an action is not finite.
+            NonFiniteError: If an observation or an action is not finite.
         """
         actions, state = super().predict(observation, *args, **kwargs)
         check_observation(observation)
@@ -103,9 +103,11 @@ def check_net_arch(net_arch: Any, required: set[str], allowed: set[str]) -> None
 
 
 def check_finite(values: np.ndarray, name: str = "actions") -> None:
-    """Raise ``ValueError`` rather than send NaN to an environment or learn from it."""
+    """Raise :class:`NonFiniteError` rather than send NaN to an environment or learn from it."""
     if not all_finite(values):
-        raise ValueError(f"observation and weights must be finite, got {name} with NaN or infinity")
+        raise NonFiniteError(
+            f"observation and weights must be finite, got {name} with NaN or infinity"
+        )
 
 
 def with_forms(module: dict[str, Any], **policies: type[BasePolicy]) -> dict[str, Any]:

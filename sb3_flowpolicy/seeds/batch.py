@@ -141,7 +141,7 @@ class SeedBatch:
         total_timesteps: int,
         callback: BaseCallback | list[BaseCallback] | CallbackFactory | None = None,
         log_interval: int | None = 4,
-        tb_log_name: str = "SACFlow",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         checkpoint_every: int | None = None,
@@ -155,7 +155,8 @@ class SeedBatch:
                 for those that write files: ``lambda seed: EvalCallback(env,
                 best_model_save_path=f"seed_{seed}")``. Training stops when one returns False.
             log_interval: Episodes between two dumps of an agent's log.
-            tb_log_name: Name of the TensorBoard runs; ``_seed<seed>`` is appended.
+            tb_log_name: Name of the TensorBoard runs; ``_seed<seed>`` is appended. Default: that
+                of the algorithm.
             reset_num_timesteps: Whether to count from zero, or to continue.
             progress_bar: Whether to show one.
             checkpoint_every: Environment steps per agent between two checkpoints for
@@ -192,7 +193,7 @@ class SeedBatch:
         self,
         total_timesteps: int,
         callback: BaseCallback | list[BaseCallback] | CallbackFactory | None,
-        tb_log_name: str,
+        tb_log_name: str | None,
         reset_num_timesteps: bool,
         progress_bar: bool,
     ) -> dict[str, BaseCallback]:
@@ -201,8 +202,9 @@ class SeedBatch:
         for seed, (name, model) in zip(self.seeds, self._agents.items(), strict=True):
             own = callback(seed) if callable(callback) else copy.deepcopy(callback)
             total, reset = self._checkpoints.remaining(total_timesteps, reset_num_timesteps)
+            run = tb_log_name or type(model).__name__
             bar = progress_bar and seed == self.seeds[0]
-            end, ready = model._setup_learn(total, own, reset, f"{tb_log_name}_seed{seed}", bar)
+            end, ready = model._setup_learn(total, own, reset, f"{run}_seed{seed}", bar)
             if model._checkpoints.active:
                 model._checkpoints.stop()
                 raise ValueError(

@@ -270,4 +270,4 @@ class SeedNoise:
         """Restore what :meth:`state` returned."""
         for generator, saved in zip(self.generators, state["generators"], strict=True):
             generator.set_state(saved)
-        self._pool = state["pool"][state.get("next", 0) :]  # older checkpoints have a position
+        self._pool = state["pool"]

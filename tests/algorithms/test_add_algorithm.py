@@ -1,7 +1,8 @@
 """An off-policy algorithm of SB3's kind gets everything ours have from one small class.
 
-In the package that is one file in ``algorithms/``, one in ``policies/`` unless SAC's will do, a
-line in ``sb3_flowpolicy/__init__.py`` and a line in ``zoo/registration.py``.
+In the package these are at most four files of code: one in ``algorithms/``, one in ``policies/``
+unless SAC's will do, and entries in ``sb3_flowpolicy/__init__.py`` and ``zoo/registration.py``. A
+file in ``zoo_hyperparams`` has the defaults for rl_zoo3.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ Draw how trained agents explore a task of the Square, side by side, a column per
                    that all x move together, and all y
   film.webp        one episode of each agent from a second before the end of the warm-up
 
-Titles tell each model's seed and steps of training. Film and targets show the first of ten episodes
-in which the agent does not lose the square (if it loses all, the first); its warm-up is
+The titles contain each model's seed and training steps. Film and targets show the first of ten
+episodes in which the agent does not lose the square (if it loses all, the first); its warm-up is
 deterministic, so that the agents start to explore from similar states.
 Paths, correlations, and the numbers printed are those of further episodes, sampled from the start
 and kept whatever their end. The same model, --seed, and --episodes give the same column, whatever

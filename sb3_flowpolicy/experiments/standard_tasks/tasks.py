@@ -53,16 +53,8 @@ class Task(NamedTuple):
         files = resources.files("rl_zoo3") / "hyperparams"
         published = yaml.safe_load((files / f"{algorithm}.yml").read_text())[self.env_id]
         policy_kwargs = eval(published.pop("policy_kwargs", "{}"))
-        unused = (
-            "policy",
-            "n_timesteps",
-            "use_sde",
-            "sde_sample_freq",
-            "use_expln",
-            "log_std_init",
-        )
         settings, policy_kwargs = (
-            {name: value for name, value in given.items() if name not in unused}
+            {name: value for name, value in given.items() if name not in _UNUSED}
             for given in (published, policy_kwargs)
         )
         return ExperimentManager._preprocess_schedules(settings) | {"policy_kwargs": policy_kwargs}
