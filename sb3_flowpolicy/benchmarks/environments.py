@@ -11,7 +11,7 @@ import flowpolicy_envs
 from sb3_flowpolicy.benchmarks.timing import Benchmark, Candidate, Work
 
 # One id for each kind of step.
-ENVIRONMENTS = ("TunnelDiagonal-v0", "TunnelCircle-v0", "TunnelSpline-v0", "SquareHold-v0")
+ENVIRONMENTS = ("TunnelDiagonal-v0", "TunnelCircle-v1", "TunnelSpline-v0", "SquareMoveX-v1")
 # A familiar environment of similar complexity.
 BASELINE = "Pendulum-v1"
 BATCH = 64
