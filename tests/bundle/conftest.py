@@ -10,13 +10,13 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import safetensors.numpy
-from sb3_flowpolicy.benchmarks.her import Reach
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.bundle import container
 from sb3_flowpolicy.bundle.container import canonical, checksum
+from tests.reach import Reach
 
 FAST: dict[str, Any] = {
     "learning_starts": 10,
