@@ -13,24 +13,9 @@ from torch.utils._pytree import tree_leaves, tree_map
 from sb3_flowpolicy.engine.flat import FlatParameters, Layout
 from sb3_flowpolicy.engine.observations import Observations
 from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.policies.traced import AsForward
 
 Tensors = dict[str, th.Tensor]
-
-
-class AsForward(nn.Module):
-    """A function of a module as ``forward``, which is what ``functional_call`` calls.
-
-    The module's parameters have the prefix ``module.``.
-    """
-
-    def __init__(self, module: nn.Module, function: Callable[..., Any]) -> None:
-        super().__init__()
-        self.module = module
-        self.function = function
-
-    def forward(self, *arguments: Any) -> Any:
-        """Call the function."""
-        return self.function(*arguments)
 
 
 class StackedNetworks:

@@ -12,8 +12,8 @@ from torch.nn.functional import mse_loss
 
 from sb3_flowpolicy.engine.adam import AdamSettings, Moments, adam_step
 from sb3_flowpolicy.engine.flat import FlatParameters
-from sb3_flowpolicy.engine.networks import AsForward
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic, bound_gradient
+from sb3_flowpolicy.policies.traced import AsForward
 
 
 class PPOState(NamedTuple):

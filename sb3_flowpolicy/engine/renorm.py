@@ -13,7 +13,8 @@ from torch.func import functional_call
 from torch.nn.functional import linear
 
 from sb3_flowpolicy.engine.flat import FlatParameters
-from sb3_flowpolicy.engine.networks import AsForward, StackedNetworks, Tensors, per_seed
+from sb3_flowpolicy.engine.networks import StackedNetworks, Tensors, per_seed
+from sb3_flowpolicy.policies.traced import AsForward
 
 
 def renormalize(

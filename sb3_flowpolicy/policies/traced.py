@@ -61,15 +61,20 @@ class TracedCalls:
         return TracedCalls, ()
 
 
-class _Call(nn.Module):
-    """A function of modules as one module, the form that is traced."""
+class AsForward(nn.Module):
+    """A function of a module as ``forward``, for ``functional_call`` and ``jit.trace``.
 
-    def __init__(self, function: Callable[..., th.Tensor], modules: tuple[nn.Module, ...]) -> None:
+    The module's parameters have the prefix ``module.``.
+    """
+
+    def __init__(self, module: nn.Module, function: Callable[..., Any]) -> None:
         super().__init__()
-        self.function, self.parts = function, nn.ModuleList(modules)
+        self.module = module
+        self.function = function
 
-    def forward(self, *tensors: th.Tensor) -> th.Tensor:
-        return self.function(*self.parts, *tensors)
+    def forward(self, *arguments: Any) -> Any:
+        """Call the function."""
+        return self.function(*arguments)
 
 
 def _trace(
@@ -78,6 +83,7 @@ def _trace(
     tensors: tuple[th.Tensor, ...],
 ) -> Callable[..., th.Tensor]:
     """Record the graph, or return the function itself where that is not possible."""
+    call = partial(function, *modules)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore", DeprecationWarning)
         warnings.simplefilter("always", th.jit.TracerWarning)
@@ -86,8 +92,9 @@ def _trace(
             "ignore", category=th.jit.TracerWarning, module=r"sb3_flowpolicy\.distributions\.base"
         )
         try:
-            graph = th.jit.trace(_Call(function, modules), tensors, check_trace=False)
+            module = AsForward(nn.ModuleList(modules), call)
+            graph = th.jit.trace(module, tensors, check_trace=False)
         except (AttributeError, RuntimeError):
             graph = None
     branches = any(issubclass(one.category, th.jit.TracerWarning) for one in caught)
-    return partial(function, *modules) if graph is None or branches else graph
+    return call if graph is None or branches else graph
