@@ -24,7 +24,7 @@ POLICIES = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
 # Steps per call of learn() and seed, enough to make the overhead of a call negligible.
 CHUNK = 500
 QUICK_START, QUICK_CHUNK = 50, 10
-# rl_zoo3's settings without gSDE; rollouts on Pendulum-v1 are shorter.
+# Sizes as in rl_zoo3's settings, with SB3's tanh layers; rollouts on Pendulum-v1 are shorter.
 PPO_SETTINGS: dict[str, dict[str, Any]] = {
     "Pendulum-v1": {"n_envs": 4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
     "HalfCheetahBulletEnv-v0": {
