@@ -108,7 +108,7 @@ EXPLORATION_CLAIMS = (
         source="ours",
         title="Moving the square along x with all densities, gSDE and colored noise",
         thesis="Not in the thesis, which compares Gauss, LR and NF.",
-        settings=(Setting("move-x", "SquareMoveX-v0", overrides=_SMALLER),),
+        settings=(Setting("move-x", "SquareMoveX-v1", overrides=_SMALLER),),
         agents=_ON_SQUARE,
         checks=(
             *(
