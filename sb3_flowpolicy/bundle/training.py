@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_flowpolicy.bundle.container import Arrays, tensor_like
-from sb3_flowpolicy.common.validation import Check, is_number, number
+from sb3_flowpolicy.common.validation import Check, number
 
 _rate = number(0)
 _LINE: dict[str, Check] = {"start": _rate, "end": _rate, "end_fraction": number(0, 1, above=True)}
@@ -26,7 +26,7 @@ def rate_to_spec(rate: Any) -> Any:
         rate = rate.value_schedule
     if isinstance(rate, ConstantSchedule):
         rate = rate.val
-    if is_number(rate):
+    if not callable(rate):
         return _rate("learning_rate", rate)
     if type(rate) is LinearSchedule:
         return {"schedule": "linear", **{key: getattr(rate, key) for key in _LINE}}

@@ -42,9 +42,14 @@ def number(least: float = -math.inf, most: float = math.inf, above: bool = False
     """Accept finite numbers from ``least`` (or ``above`` it) to ``most``, not booleans."""
 
     def check(name: str, value: Any) -> float:
-        if not is_number(value):
+        real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        try:
+            finite = real and math.isfinite(value)
+        except OverflowError:  # an integer beyond floats
+            finite = False
+        if not real:
             expected = "a number"
-        elif not math.isfinite(value):
+        elif not finite:
             expected = "finite"
         elif value < least or (above and value == least):
             expected = f"{'above' if above else 'at least'} {least:g}"
@@ -108,17 +113,6 @@ def or_schedule(check: Check) -> Check:
 def or_infinity(check: Check) -> Check:
     """Accept infinity, too."""
     return lambda name, value: value if value == math.inf else check(name, value)
-
-
-def is_number(value: Any) -> bool:
-    """Whether this is a real number that floats can hold: no boolean, no array."""
-    if not isinstance(value, numbers.Real) or isinstance(value, bool):
-        return False
-    try:
-        float(value)
-    except OverflowError:
-        return False
-    return True
 
 
 def entropy_coefficient(name: str, value: Any) -> str | float:

@@ -91,10 +91,6 @@ class BatchedVecEnv(VecEnv):
         images: Any = self.venv.render()
         return list(images or [None] * self.num_envs)
 
-    def has_attr(self, attr_name: str) -> bool:
-        """Return whether the environments have an attribute."""
-        return hasattr(self.venv, attr_name)
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return the attribute once per environment."""
         return [getattr(self.venv, attr_name) for _ in self._get_indices(indices)]
