@@ -5,6 +5,7 @@ start-up hook calls `plug_in`. Without the hook, use `python -m sb3_flowpolicy.z
 program, `register`.
 """
 
-from sb3_flowpolicy.zoo.registration import ALGORITHMS, hyperparameter_file, plug_in, register
+from sb3_flowpolicy.common.hyperparameters import hyperparameter_file
+from sb3_flowpolicy.zoo.registration import ALGORITHMS, plug_in, register
 
 __all__ = ["ALGORITHMS", "hyperparameter_file", "plug_in", "register"]

@@ -4,9 +4,10 @@ import functools
 import importlib
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+from sb3_flowpolicy.common.hyperparameters import hyperparameter_file
 
 _CLASSES = {
     "sac_flow": "SACFlow",
@@ -21,17 +22,6 @@ ALGORITHMS = tuple(_CLASSES)
 """Names for `--algo`. Each has a hyperparameter file, which names the policy."""
 
 _MARK = "_knows_sb3_flowpolicy"
-
-
-def hyperparameter_file(algorithm: str) -> Path:
-    """Return the path of the YAML file that rl_zoo3 reads without `-conf`.
-
-    Example:
-        >>> hyperparameter_file("sac_flow").name
-        'sac_flow.yml'
-    """
-    package = importlib.import_module("zoo_hyperparams")
-    return Path(package.__path__[0], f"{algorithm}.yml")
 
 
 def register() -> None:
