@@ -68,11 +68,9 @@ class DeployedPolicy(nn.Module):
         )
 
 
-def random_inputs(
-    policy: DistributionPolicy, stochastic: bool, n: int, rng: np.random.Generator
-) -> list[np.ndarray]:
+def random_inputs(policy: DistributionPolicy, stochastic: bool, n: int = 64) -> list[np.ndarray]:
     """Draw n raw observations per key, uniform where bounded and normal elsewhere, and noise."""
-    drawn = []
+    rng, drawn = np.random.default_rng(0), []
     for part in parts_of(policy.observation_space).values():
         part.seed(int(rng.integers(2**31)))
         drawn.append(np.stack([np.asarray(part.sample()) for _ in range(n)]))

@@ -25,7 +25,6 @@ from sb3_flowpolicy.policies import FlowActor
 FORMAT = "sb3_flowpolicy.onnx.1"
 #: Largest accepted difference to ``predict``, relative to the range of the actions.
 TOLERANCE = 1e-5
-_N_CHECKED = 64
 
 
 def export_onnx(
@@ -81,7 +80,7 @@ def export_onnx(
         )
     statistics = normalization.of_model(model, vec_normalize)
     deployed = DeployedPolicy(policy, statistics, stochastic).cpu().eval()
-    inputs = random_inputs(policy, stochastic, _N_CHECKED, np.random.default_rng(0))
+    inputs = random_inputs(policy, stochastic)
     proto = _translate(deployed, [th.from_numpy(array[:2]) for array in inputs])
     _add_metadata(proto, model, statistics is not None, stochastic)
     content = proto.SerializeToString()
