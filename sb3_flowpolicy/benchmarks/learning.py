@@ -28,7 +28,10 @@ QUICK_START, QUICK_CHUNK = 50, 10
 PPO_SETTINGS: dict[str, dict[str, Any]] = {
     "Pendulum-v1": {"n_envs": 4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
     "HalfCheetahBulletEnv-v0": {
-        **{"n_envs": 1, "n_steps": 512, "batch_size": 128, "n_epochs": 20},
+        "n_envs": 1,
+        "n_steps": 512,
+        "batch_size": 128,
+        "n_epochs": 20,
         "policy_kwargs": {"net_arch": [256, 256], "ortho_init": False, "log_std_init": -2},
     },
 }
