@@ -137,7 +137,7 @@ def train(
             model.set_logger(configure(str(folder / f"log_{index}"), ["csv"]))
         batch.learn(steps, callback=Tell(), **checkpoints)
         models = batch.models
-    th.save([_outcome(model) for model in models], folder / "outcome.pt")
+    th.save([outcome(model) for model in models], folder / "outcome.pt")
 
 
 def compare(one: Path, other: Path) -> list[str]:
@@ -152,13 +152,13 @@ def compare(one: Path, other: Path) -> list[str]:
             if any(value is None for value in values) or not th.equal(*values):
                 differences.append(f"agent {index}: {key}")
     logs = sorted(path.relative_to(one) for path in one.rglob("*.csv"))
-    differences += [str(log) for log in logs if _rows(one / log) != _rows(other / log)]
-    if not logs or any(len(_rows(one / log)) < 2 for log in logs):
+    differences += [str(log) for log in logs if log_rows(one / log) != log_rows(other / log)]
+    if not logs or any(len(log_rows(one / log)) < 2 for log in logs):
         differences.append("nothing was logged")
     return differences
 
 
-def _outcome(model: Any) -> dict[str, Any]:
+def outcome(model: Any) -> dict[str, Any]:
     """Flatten everything that training has changed: name -> tensor."""
     import torch as th
 
@@ -183,7 +183,7 @@ def _outcome(model: Any) -> dict[str, Any]:
     return {name: value.clone() for name, value in found.items()}
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def log_rows(path: Path) -> list[dict[str, str]]:
     """Read a log, without the columns of wall-clock time; the order of columns is not its own."""
     with path.open() as file:
         lines = [line for line in file if not line.startswith("#")]

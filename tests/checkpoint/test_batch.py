@@ -7,15 +7,14 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import IdentityEnvBox
 from stable_baselines3.common.logger import configure
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow, SeedBatch
 from sb3_flowpolicy.checkpoint import RunCheckpointCallback
-from tests.checkpoint.kill_and_resume import _outcome, _rows
+from tests.checkpoint.broken_runs import BreakAt, BrokenError, differences
+from tests.checkpoint.kill_and_resume import log_rows
 
 FAST: dict[str, Any] = {
     "learning_starts": 20,
@@ -26,31 +25,12 @@ FAST: dict[str, Any] = {
 SEEDS = [3, 5]
 
 
-class BrokenError(Exception):
-    """What a run dies of here."""
-
-
-class BreakAt(BaseCallback):
-    """Breaks a run off; counts on where an earlier one stopped."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-        self.seen = 0
-
-    def _on_step(self) -> bool:
-        self.seen += 1
-        if self.num_timesteps == self.step:
-            raise BrokenError
-        return True
-
-
 def short_pendulum() -> gym.Env:
     return gym.make("Pendulum-v1", max_episode_steps=7)
 
 
 def learn(batch: SeedBatch, folder: Path, step: int | None, **checkpoints: Any) -> list[BreakAt]:
-    callbacks = [BreakAt(step or -1) for _ in SEEDS]
+    callbacks = [BreakAt(step or 1000) for _ in SEEDS]
     for seed, model in zip(SEEDS, batch.models, strict=True):
         model.set_logger(configure(str(folder / f"log{seed}"), ["csv"]))
     try:
@@ -76,12 +56,11 @@ def test_resumed_batch_is_the_undisturbed_one(env: Any, tmp_path: Path) -> None:
         if step is not None:
             assert [one.seen for one in counters] == [128, 127]  # the first has stopped the second
     for seed, one, other in zip(SEEDS, calm.models, batch.models, strict=True):
-        left, right = _outcome(one), _outcome(other)
-        assert left["_n_updates"] == 130
-        assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+        assert one._n_updates == 130
+        assert differences(one, other) == []
         for log in (f"log{seed}/progress.csv", f"seed_{seed}.monitor.csv"):
             if env != "SquareHold-v0":  # whose episodes are too long to end
-                assert _rows(tmp_path / "calm" / log) == _rows(folder / log) != []
+                assert log_rows(tmp_path / "calm" / log) == log_rows(folder / log) != []
 
 
 def test_several_calls_of_learn(tmp_path: Path) -> None:
@@ -96,8 +75,7 @@ def test_several_calls_of_learn(tmp_path: Path) -> None:
     assert batch.models[0].num_timesteps == 80
     batch.learn(50, reset_num_timesteps=False, **checkpoints)
     for one, other in zip(calm.models, batch.models, strict=True):
-        left, right = _outcome(one), _outcome(other)
-        assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+        assert differences(one, other) == []
 
 
 def test_an_agent_of_a_checkpoint_is_small_and_ordinary(tmp_path: Path) -> None:

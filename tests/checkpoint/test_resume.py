@@ -1,4 +1,4 @@
-"""A run that was broken off and resumed is the run that was not, bit for bit."""
+"""A run that is broken off and resumed equals an undisturbed run, bit for bit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.checkpoint import RunCheckpointCallback
 from sb3_flowpolicy.common.vec_env import make_batched_env
-from tests.checkpoint.kill_and_resume import _outcome, _rows
+from tests.checkpoint.broken_runs import BreakAt, BrokenError, differences
+from tests.checkpoint.kill_and_resume import log_rows
 
 ENV = "TunnelDiagonal-v0"
 FAST: dict[str, Any] = {
@@ -38,23 +39,6 @@ FAST: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [8]},
 }
 TOTAL, EVERY, BREAKS = 110, 20, (47, 92)
-
-
-class BrokenError(Exception):
-    """What a run dies of here."""
-
-
-class BreakAt(BaseCallback):
-    """Breaks a run off in the middle of a rollout."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= self.step:
-            raise BrokenError
-        return True
 
 
 def run_to(
@@ -84,13 +68,13 @@ def run_to(
     return model
 
 
-def differences(
+def compare(
     make_env: Callable[[], Any],
     tmp_path: Path,
     callbacks: Callable[[], list[BaseCallback]] = list,
     **changes: Any,
 ) -> list[str]:
-    """Compare a run with one that was broken off twice; also their logs."""
+    """Compare a run and its log with those of a run that was broken off twice."""
     settings = {
         "policy": "FlowPolicy",
         **FAST,
@@ -104,30 +88,11 @@ def differences(
     resumed = run_to(None, make_env, path, settings, callbacks, resume=True)
     assert resumed.num_timesteps == calm.num_timesteps >= TOTAL
     assert calm._n_updates > 0
-    left, right = _state(calm), _state(resumed)
-    assert left.keys() == right.keys()
-    found = [name for name, value in left.items() if not th.equal(value, right[name])]
-    logs = [_rows(folder / "progress.csv") for folder in (tmp_path / "calm", path.parent / "log")]
-    assert len(logs[0]) > 2
-    return found + (["log"] if logs[0] != logs[1] else [])
-
-
-def _state(model: SACFlow) -> dict[str, th.Tensor]:
-    """Everything that training changes, of any kind of replay buffer."""
-    if isinstance(model.observation_space, gym.spaces.Dict):
-        buffer: Any = model.replay_buffer
-        model.replay_buffer = None
-        arrays = {f"obs {key}": value for key, value in buffer.observations.items()}
-        arrays |= {"actions": buffer.actions, "rewards": buffer.rewards, "dones": buffer.dones}
-        found = {name: th.from_numpy(value) for name, value in arrays.items()}
-        found |= {f"p {key}": value for key, value in model.policy.state_dict().items()}
-        return found
-    found = _outcome(model)
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None:
-        found["mean"] = th.from_numpy(np.asarray(normalize.obs_rms.mean))  # type: ignore[union-attr]
-        found["returns"] = th.from_numpy(normalize.returns)
-    return found
+    found = differences(calm, resumed)
+    expected = log_rows(tmp_path / "calm" / "progress.csv")
+    assert len(expected) > 2
+    logged = log_rows(path.parent / "log" / "progress.csv")
+    return found + (["log"] if logged != expected else [])
 
 
 def normalized() -> VecEnv:
@@ -162,7 +127,7 @@ VARIANTS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_resumed_run_is_the_undisturbed_one(variant: str, tmp_path: Path) -> None:
     make_env, changes = VARIANTS[variant]
-    assert differences(make_env, tmp_path, **changes) == []
+    assert compare(make_env, tmp_path, **changes) == []
 
 
 def test_action_noise_goes_on(tmp_path: Path) -> None:
@@ -176,13 +141,12 @@ def test_action_noise_goes_on(tmp_path: Path) -> None:
     calm = run_to(None, lambda: gym.make(ENV), None, noisy())
     run_to(47, lambda: gym.make(ENV), path, noisy())
     resumed = run_to(None, lambda: gym.make(ENV), path, noisy(), resume=True)
-    left, right = _state(calm), _state(resumed)
-    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert differences(calm, resumed) == []
 
 
 def test_state_dependent_exploration_on_sb3s_own_loop(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="the stock loop"):
-        assert differences(lambda: gym.make(ENV), tmp_path, policy=SACPolicy, use_sde=True) == []
+        assert compare(lambda: gym.make(ENV), tmp_path, policy=SACPolicy, use_sde=True) == []
 
 
 def test_hindsight_replay(tmp_path: Path) -> None:
@@ -190,7 +154,7 @@ def test_hindsight_replay(tmp_path: Path) -> None:
         return BitFlippingEnv(n_bits=2, continuous=True, max_steps=5)
 
     changes = {"policy": "MultiInputFlowPolicy", "replay_buffer_class": HerReplayBuffer}
-    assert differences(goal_env, tmp_path, **changes) == []
+    assert compare(goal_env, tmp_path, **changes) == []
 
 
 def test_callbacks_and_their_environments_go_on(tmp_path: Path) -> None:
@@ -204,7 +168,7 @@ def test_callbacks_and_their_environments_go_on(tmp_path: Path) -> None:
         return [made[-1]]
 
     make_env = lambda: gym.make("Pendulum-v1", max_episode_steps=13)  # noqa: E731
-    assert differences(make_env, tmp_path, evaluate) == []
+    assert compare(make_env, tmp_path, evaluate) == []
     calm, *_, resumed = made
     assert resumed.evaluations_timesteps == calm.evaluations_timesteps == [25, 50, 75, 100]
     assert resumed.evaluations_results == calm.evaluations_results
@@ -221,7 +185,7 @@ def test_monitor_files_are_those_of_the_undisturbed_run(tmp_path: Path) -> None:
     path = tmp_path / "run" / "checkpoints"
     run_to(47, monitored("broken"), path, settings)
     run_to(None, monitored("broken"), path, settings, resume=True)
-    calm, broken = (_rows(tmp_path / f"{name}.monitor.csv") for name in ("calm", "broken"))
+    calm, broken = (log_rows(tmp_path / f"{name}.monitor.csv") for name in ("calm", "broken"))
     assert calm == broken
     assert len(calm) > 10
     # One header, and its clock goes on.
@@ -270,8 +234,7 @@ def test_several_calls_of_learn(tmp_path: Path) -> None:
     # Once more when all is done, too.
     for resumed in (program(None, True), program(None, True)):
         assert resumed.num_timesteps == 110
-        left, right = _state(calm), _state(resumed)
-        assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+        assert differences(calm, resumed) == []
 
 
 def test_a_second_call_that_breaks_twice_keeps_its_end(tmp_path: Path) -> None:
@@ -304,8 +267,7 @@ def test_a_run_goes_on_after_a_checkpoint_that_could_not_be_written(
         model.learn(80, **checkpoints)
     model.learn(80, **checkpoints, reset_num_timesteps=False)
     resumed = SACFlow.resume(tmp_path, ENV)
-    left, right = _state(model), _state(resumed)
-    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert differences(model, resumed) == []
 
 
 class Locked(gym.Wrapper):
@@ -368,15 +330,13 @@ def test_without_further_checkpoints_and_by_callback(tmp_path: Path) -> None:
     assert resumed.replay_buffer is not None
     assert resumed.replay_buffer.size() == 40
     resumed.learn(80)
-    left, right = _state(calm), _state(resumed)
-    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert differences(calm, resumed) == []
     assert sorted(tmp_path.rglob("*")) == before
     # The same command given again goes on, too, with a model that is new.
     again = SACFlow("FlowPolicy", ENV, **FAST)
     callback = RunCheckpointCallback(20, tmp_path, resume=True)
     again.learn(80, callback=callback)
-    right = _state(again)
-    assert [name for name, value in left.items() if not th.equal(value, right[name])] == []
+    assert differences(calm, again) == []
     assert again.ep_info_buffer is not None
     assert calm.ep_info_buffer is not None
     assert [one["r"] for one in again.ep_info_buffer] == [one["r"] for one in calm.ep_info_buffer]
