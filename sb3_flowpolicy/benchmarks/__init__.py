@@ -1,1 +1,1 @@
-"""How fast updates, learning, environments and flows are, next to their peers."""
+"""Benchmarks of updates, learning, acting, environments and flows, each with a baseline."""

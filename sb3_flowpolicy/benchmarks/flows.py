@@ -1,4 +1,4 @@
-"""RealNVP against zuko's of the same shape: forward and backward pass of sampling and scoring."""
+"""Forward and backward passes of RealNVP and of zuko's RealNVP of the same shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rates of candidates that run in turns, so that other load on the machine affects all alike."""
+"""Rates of candidates that take turns, so that other load on the machine slows all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gradient updates per second: ours against stock's and against the matrix products alone."""
+"""Gradient updates per second, compared with SB3 and with the matrix products alone."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ CONTRIB_SHAPES = (Shape(64, 17, 6), Shape(256, 42, 8))
 
 
 class Unmoved(gym.Env):
-    """Only the spaces of an environment: updates read the replay buffer only."""
+    """An environment that has only spaces, because updates read only the replay buffer."""
 
     def __init__(self, obs_dim: int, action_dim: int) -> None:
         self.observation_space = gym.spaces.Box(-1, 1, (obs_dim,), np.float32)

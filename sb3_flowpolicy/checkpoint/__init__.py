@@ -1,4 +1,4 @@
-"""Checkpoints that hold everything, so that a resumed run equals one that was not interrupted."""
+"""Complete checkpoints: a resumed run equals one that was not interrupted."""
 
 from sb3_flowpolicy.checkpoint.callback import RunCheckpointCallback
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints

@@ -1,4 +1,4 @@
-"""Checkpoints by callback: from a hyperparameter file, for example."""
+"""Checkpoints as a callback, for example in a hyperparameter file."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class RunCheckpointCallback(BaseCallback):
     Args:
         checkpoint_every: Environment steps between two checkpoints, at least 1.
         checkpoint_path: Folder for the checkpoints.
-        resume: Whether a new model continues from the folder's newest checkpoint, if there is one:
-            the same command, given again, then continues the run.
+        resume: Whether a new model continues from the folder's newest checkpoint, if there is one.
+            The same command, given again, then continues the run.
 
     Raises:
         ValueError: If ``checkpoint_every`` is below 1; when learning starts, if the model cannot be
@@ -55,7 +55,7 @@ class RunCheckpointCallback(BaseCallback):
 
 
 def _resume_in_place(model: Any, checkpoints: RunCheckpoints, path: str | Path) -> None:
-    """Turn a new model into the agent of the newest checkpoint, while learning is being set up."""
+    """Turn a new model into the agent of the newest checkpoint, during the setup of ``learn``."""
     checkpoint = open_checkpoint(path, type(model).__name__)
     check_same_build(model.env, checkpoint.manifest["layers"]["model"])
     archive = checkpoint.folder / "model.zip"

@@ -1,4 +1,4 @@
-"""The state of environments, layer by layer, and how to restore it in equally built ones."""
+"""Collect the state of environments, layer by layer, and restore it in equally built ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import IO, Any
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 
-# How an environment was made, and open files: steps do not change them.
+# How an environment was made, and open files; steps do not change these.
 _NOT_STATE = {"class_attributes", "env_fns", "spec", "_cached_spec", "results_writer"}
 
 LayerStates = dict[str, dict[str, Any]]
@@ -69,7 +69,7 @@ def set_layer_states(env: Any, states: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def check_same_build(env: Any, names: list[str]) -> None:
-    """Raise ``ValueError`` unless the environment consists of the layers of these names."""
+    """Raise ``ValueError`` unless the layers of the environment have these names."""
     if list(layers(env)) != names:
         raise ValueError(
             "env must be built and wrapped as when the checkpoint was written, expected "

@@ -1,4 +1,4 @@
-"""What a run has logged: the contents of log files, and values not yet written."""
+"""Save and restore logs: the contents of log files, and values not yet written."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def log_files(logger: Logger) -> dict[str, IO[str]]:
 
 
 def read_texts(files: Mapping[str, IO[str]]) -> dict[str, str]:
-    """Read open files; those that were deleted are left out.
+    """Read open files completely, except deleted ones.
 
-    Whole contents, not lengths: opening a log again empties it.
+    Lengths would not suffice, because opening a log again empties it.
     """
     texts = {}
     for name, file in files.items():
@@ -51,7 +51,7 @@ def write_texts(files: Mapping[str, IO[str]], texts: Mapping[str, str]) -> None:
 
 
 def log_state(logger: Logger) -> dict[str, Any]:
-    """Collect what a logger has written and what it is about to write, except pictures."""
+    """Collect what a logger has written and will write next, except pictures."""
     kept = {key for key, value in logger.name_to_value.items() if is_data(value)}
     waiting = [
         {key: value for key, value in part.items() if key in kept} for part in _waiting(logger)
@@ -62,7 +62,7 @@ def log_state(logger: Logger) -> dict[str, Any]:
 def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) -> None:
     """Restore what :func:`log_state` returned.
 
-    TensorBoard will hide what came after ``num_timesteps``.
+    TensorBoard will hide events after ``num_timesteps``.
     """
     for part, saved in zip(_waiting(logger), state["waiting"], strict=True):
         part.clear()

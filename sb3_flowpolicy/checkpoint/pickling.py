@@ -18,12 +18,11 @@ import torch as th
 # Objects of these packages pickle as handles that are meaningless in another process.
 _SIMULATORS = ("pybullet",)
 
-
 _DATA = (bool, int, float, str, bytes, Path, np.ndarray, np.generic, np.random.Generator, th.Tensor)
 
 
 def is_data(value: Any) -> bool:
-    """Whether a value is made of numbers, text and arrays, and can be pickled without surprise.
+    """Whether a value consists of numbers, text and arrays only.
 
     Example:
         >>> is_data({"best": 1.5, "all": [1, 2]}), is_data(print)

@@ -1,4 +1,4 @@
-"""A replay buffer on disk, as files of rows: a checkpoint writes only what has changed."""
+"""A replay buffer on disk, as files of rows; a checkpoint writes only those that changed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-# A file is written again when one of its rows has changed. Smaller ones would be many.
+# Files are written again when one of their rows has changed; smaller files would be too many.
 _FILE_BYTES = 4_000_000
 
 
@@ -21,7 +21,7 @@ class Ring:
         columns: Name -> array, (capacity, ...).
         pos: Where the next row goes.
         full: Whether all rows are filled.
-        source: The object that it belongs to, to detect that it was replaced.
+        source: The object that holds the rows, to detect its replacement.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -53,7 +53,7 @@ class RowFiles:
         self._files: Sequence[dict[str, Any]] = ()
 
     def note(self, ring: Ring, steps: int, files: Sequence[dict[str, Any]]) -> None:
-        """Remember that these files hold the ring as it is now, after so many steps."""
+        """Remember that these files hold the ring as it is now, after ``steps`` steps."""
         self._ring, self._steps, self._files = ring, steps, files
 
     def write(self, ring: Ring, steps: int, prefix: Path) -> list[dict[str, Any]]:
@@ -82,7 +82,7 @@ class RowFiles:
         return files
 
     def _added(self, ring: Ring, steps: int) -> int:
-        """Count the new rows: all, unless ``steps`` explains how the ring has moved."""
+        """Count the new rows: all of them, unless ``steps`` explains the position of the ring."""
         before, added = self._ring, steps - self._steps
         if (
             before is not None

@@ -1,4 +1,4 @@
-"""Writing checkpoints while a run goes on, and resuming one."""
+"""Write checkpoints during a run, and resume a run from one."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _STATE = "state.pt"
 class RunCheckpoints:
     """The checkpoints of one learner: an algorithm, or several in lockstep.
 
-    Checkpoints are written, and resumed from, between rollouts: at that moment the state of a run
-    is in objects, none of it in local variables.
+    Checkpoints are written and restored between rollouts, when the whole state of a run is in
+    objects and none of it in local variables.
 
     Args:
         describe: Returns what a checkpoint consists of.
@@ -44,8 +44,8 @@ class RunCheckpoints:
         self._store: CheckpointStore | None = None
         self._rows = RowFiles()
         self._signals = StopSignals()
-        # Of a run that was resumed, until it learns again: the state to restore once learning has
-        # begun, and the step at which the interrupted call of ``learn`` began.
+        # After loading, until learning begins: the state to restore at that moment, and the step
+        # at which the interrupted call of ``learn`` began.
         self._late: bytes | None = None
         self._begun = 0
         #: Environments whose state could not be saved: they begin new episodes when resumed.
@@ -118,22 +118,22 @@ class RunCheckpoints:
         self._signals.release()
 
     def remaining(self, total_timesteps: int, reset_num_timesteps: bool) -> tuple[int, bool]:
-        """Return the arguments with which an interrupted call of ``learn`` goes on to its end."""
+        """Return the arguments with which ``learn`` continues an interrupted call to its end."""
         if not self.resuming:
             return total_timesteps, reset_num_timesteps
         end = total_timesteps + (0 if reset_num_timesteps else self._begun)
         return end - self._run().first.num_timesteps, False
 
     def between_rollouts(self, callbacks: Mapping[str, BaseCallback]) -> bool:
-        """Restore what waits for this moment, and write a checkpoint if one is due.
+        """Restore the rest of a loaded checkpoint, and write a checkpoint if one is due.
 
-        ``callbacks`` are those of the agents' ``learn``. Returns whether to go on: False after
+        ``callbacks`` are those of the agents' ``learn``. Returns whether to continue: False after
         SIGTERM and Ctrl-C.
         """
         if self._late is not None:
             run = self._run(callbacks)
             state.restore_late(run, self._late)
-            for agent in run.agents.values():  # not where a call before this one began
+            for agent in run.agents.values():  # may hold the start of an earlier call
                 agent._num_timesteps_at_start = self._begun
             self._late = None
             self.opaque.clear()
@@ -185,7 +185,7 @@ class RunCheckpoints:
         return run
 
     def _write(self, run: Run) -> None:
-        """Write a checkpoint, unless this step has one."""
+        """Write a checkpoint, unless there is one of this step."""
         now, ring = run.first.num_timesteps, run.ring()
         if now == self._last:
             return

@@ -14,7 +14,7 @@ _WATCHED = (signal.SIGINT, signal.SIGTERM)
 class StopSignals:
     """Notes the first SIGINT or SIGTERM; a second one takes effect at once.
 
-    Python handles signals in the main thread only; in other threads nothing is noted.
+    Does nothing outside the main thread, where Python does not handle signals.
     """
 
     def __init__(self) -> None:

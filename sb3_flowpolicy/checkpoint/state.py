@@ -1,4 +1,4 @@
-"""The state of a run without its networks and replay buffer, to bytes and back."""
+"""Convert the state of a run, without networks and replay buffer, to bytes and back."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_flowpolicy.checkpoint import environments, logs, pickling
 from sb3_flowpolicy.checkpoint.rows import Ring
 
-# Attributes of SB3's that its load() leaves out or creates anew, and counters.
+# Counters, and attributes that SB3's load() leaves out or creates anew.
 _ATTRIBUTES = (
     "num_timesteps",
     "_n_updates",
@@ -44,9 +44,9 @@ class Run:
         agents: Agents by the name of their files.
         environments: Environments by name.
         ring: Returns the contents of the replay buffer; None if it is not made of rows.
-        extra: Returns the state of the rest.
-        set_extra: Restores it.
-        callbacks: The callback that each agent's ``learn`` was given, while it runs.
+        extra: Returns further state.
+        set_extra: Restores what ``extra`` returned.
+        callbacks: The callback of each agent's ``learn``, while it runs.
         opaque: Environments that cannot be pickled.
     """
 
@@ -61,11 +61,11 @@ class Run:
 
     @property
     def first(self) -> OffPolicyAlgorithm:
-        """The first agent: all have taken as many steps."""
+        """The first agent; all agents have taken equally many steps."""
         return next(iter(self.agents.values()))
 
     def known(self) -> dict[str, object]:
-        """Name the objects that exist in a resumed run, too."""
+        """Name the objects that a resumed run has as well."""
         found: dict[str, object] = {}
         for name, env in {**self.environments, **self.callback_environments()}.items():
             found |= {f"{name}/{place}": layer for place, layer in environments.layers(env).items()}
@@ -81,7 +81,7 @@ class Run:
         return found
 
     def all_callbacks(self) -> dict[str, BaseCallback]:
-        """Name the callbacks of all agents, and those inside of them, by type."""
+        """Name the callbacks of all agents, nested ones included, by type."""
         found: dict[str, BaseCallback] = {}
         for name, root in self.callbacks.items():
             for callback in _tree(root):
@@ -91,7 +91,7 @@ class Run:
         return found
 
     def callback_environments(self) -> dict[str, VecEnv]:
-        """Name the environments that callbacks own, to evaluate agents in for example."""
+        """Name the environments of callbacks, such as that of ``EvalCallback``."""
         training = [id(env) for env in self.environments.values()]
         return {
             f"{name}.{key}": value
@@ -110,7 +110,7 @@ def collect(run: Run) -> dict[str, bytes]:
 
 
 def _pickle(run: Run, part: Callable[[Run], dict[str, Any]]) -> bytes:
-    """Pickle; if that fails, leave out the environments that cannot be pickled from now on."""
+    """Pickle; if that fails, leave out environments that cannot be pickled, also later on."""
     known = run.known()
     try:
         return pickling.dumps(part(run), known)
@@ -156,7 +156,7 @@ def restore_early(run: Run, pickled: bytes) -> None:
 
 
 def restore_late(run: Run, pickled: bytes) -> None:
-    """Restore what beginning to learn has changed: random numbers, clocks, callbacks, logs."""
+    """Restore what the beginning of ``learn`` resets: random numbers, clocks, callbacks, logs."""
     known = run.known()
     state = pickling.loads(pickled, known)
     for name, agent in run.agents.items():
@@ -219,7 +219,7 @@ def _late(run: Run) -> dict[str, Any]:
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     """Collect a callback's counters and records: attributes made of numbers, text and arrays.
 
-    Attributes named like arguments of its constructor are settings and may change: left out.
+    Leaves out attributes named like constructor arguments: these are settings, which may change.
     """
     constructors = [kind.__init__ for kind in type(callback).__mro__]  # type: ignore[misc]
     settings = {name for one in constructors for name in inspect.signature(one).parameters}

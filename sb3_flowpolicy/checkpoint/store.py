@@ -25,26 +25,28 @@ _PARTIAL = ".partial"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A complete checkpoint: its folder, and ``kind``, ``num_timesteps``, ``segments``, ..."""
+    """A complete checkpoint: its folder and its manifest (``kind``, ``num_timesteps``, ...)."""
 
     folder: Path
     manifest: dict[str, Any]
 
     @property
     def rows_folder(self) -> Path:
-        """Where the files of the replay buffer are, which several checkpoints share."""
+        """The folder with the files of the replay buffer, which several checkpoints share."""
         return self.folder.parent / _ROWS
 
 
 class CheckpointStore:
     """The checkpoints of one run.
 
-    A checkpoint is a folder ``00007-step-70000``. Its files and the rows that are new since the one
-    before are written and synchronized under other names first; renaming the folder completes it. A
-    manifest lists the SHA-256 of every file, those of earlier rows included.
+    A checkpoint is a folder such as ``00007-step-70000``. Its files, and the rows added since the
+    previous checkpoint, are first written to a temporary folder and synchronized; renaming that
+    folder completes the checkpoint. A manifest lists the SHA-256 of every file, including those of
+    earlier rows.
 
-    The folder is made when the first checkpoint is written. ``good`` are those in it that are known
-    to be undamaged, oldest first.
+    Args:
+        path: Folder of the checkpoints, made with the first one.
+        good: Checkpoints in it that are known to be undamaged, oldest first.
     """
 
     def __init__(self, path: str | Path, good: Sequence[Checkpoint] = ()) -> None:
@@ -90,13 +92,13 @@ class CheckpointStore:
         facts: dict[str, Any],
         write_files: Callable[[Path, Path], dict[str, Any]],
     ) -> Checkpoint:
-        """Write a checkpoint, then delete those that are not needed any more.
+        """Write a checkpoint, then delete those that are no longer needed.
 
         Args:
             num_timesteps: Environment steps so far.
-            facts: What the manifest says.
-            write_files: Function of the checkpoint's folder and of a prefix for files of new rows;
-                writes files and returns more facts, among them the ``segments`` that hold the rows.
+            facts: Entries of the manifest.
+            write_files: Function of the checkpoint's folder and of a prefix for files of new rows.
+                Writes files and returns further entries, such as the ``segments`` of all rows.
         """
         number = max(map(_number, self.folders()), default=0) + 1
         name = f"{number:05d}-step-{num_timesteps}"
@@ -125,7 +127,7 @@ class CheckpointStore:
         return checkpoint
 
     def _tidy(self) -> None:
-        """Delete checkpoints beyond the last good ones, and rows that none of these needs."""
+        """Delete all but the last good checkpoints, and the rows that only the others need."""
         kept = {checkpoint.folder for checkpoint in self._good}
         for folder in self.folders():
             if folder not in kept:
@@ -137,7 +139,7 @@ class CheckpointStore:
 
 
 def has_checkpoint(path: str | Path) -> bool:
-    """Whether a run can be resumed from a folder, to decide between that and a new one.
+    """Whether a folder holds a checkpoint to resume from.
 
     Example:
         >>> has_checkpoint("no/such/folder")
@@ -195,7 +197,7 @@ def _digest(path: Path, synchronize: bool = False) -> str:
 def _synchronize(path: Path) -> None:
     """Wait until a file's contents, or a folder's entries, are on the disk."""
     if path.is_dir() and os.name == "nt":
-        return  # Windows has no handles of folders to wait for
+        return  # Windows cannot synchronize folders
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""What the package's commands have in common."""
+"""Argument types and error messages for the package's commands."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ def check_folder_of(parser: argparse.ArgumentParser, option: str, path: Path | N
 
 
 def run(main: Callable[[], Any]) -> None:
-    """Run a command; say in one line what went wrong, without a traceback."""
+    """Run a command; print errors as one line, without a traceback."""
     try:
         main()
-    # rl_zoo3 asserts.
+    # AssertionError comes from rl_zoo3, which checks its arguments with assert.
     except (ValueError, AssertionError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(f"error: {error}")

@@ -13,7 +13,7 @@ from typing import Any
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Write a file completely or not at all: an interruption leaves what was there before.
+    """Write a file completely or not at all: an interruption leaves the old file.
 
     Yields:
         Path of a temporary file with the same suffix in the same folder, which replaces the file
@@ -51,14 +51,14 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, fields: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Read a JSON object with these fields: name -> type, or several types.
+    """Read a JSON object and check the types of its fields (name -> type, or several types).
 
     Raises:
         ValueError: If the file is no JSON object, or a field is missing or of another type.
     """
     try:
         content = json.loads(path.read_text())
-    except (ValueError, RecursionError) as error:  # other encodings, a hundred thousand brackets
+    except (ValueError, RecursionError) as error:  # RecursionError: very deep nesting
         raise ValueError(f"{path} must be JSON, got {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold an object, got {type(content).__name__}")

@@ -1,4 +1,4 @@
-"""What a reader needs to know about the machine that measured something."""
+"""Facts about the machine, to record with measurements."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "zuko",
 
 
 def machine() -> dict[str, Any]:
-    """Return what a reader needs to know about where the numbers were measured."""
+    """Return the hardware, the load, the versions and the commit, and the date."""
     return {
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "platform": platform.platform(),
         "processor": _processor(),
         "cpu_count": os.cpu_count(),
-        # Processes that wanted to run, averaged over a minute: above 0 means others were busy.
+        # Processes that wanted to run, averaged over a minute. Near 0 on an idle machine.
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "threads": th.get_num_threads(),
         "python": platform.python_version(),
@@ -58,7 +58,7 @@ def _commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", source.name)  # the tree around may be someone else's
+        git("ls-files", "--error-unmatch", source.name)  # it may lie in another source tree
         return git("describe", "--always", "--dirty", "--abbrev=12")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -13,7 +13,7 @@ import numpy as np
 #: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
 
-# What a JSON number holds without rounding.
+# The largest integer up to which JSON numbers are exact.
 _ANY = 2**53
 
 
@@ -81,7 +81,7 @@ def one_of(*words: str) -> Check:
 
 
 def _or(check: Check, accepts: Callable[[Any], bool], also: str) -> Check:
-    """Accept further values, which messages mention."""
+    """Also accept the values that ``accepts`` names; messages call them ``also``."""
 
     def extended(name: str, value: Any) -> Any:
         if accepts(value):
@@ -96,27 +96,27 @@ def _or(check: Check, accepts: Callable[[Any], bool], also: str) -> Check:
 
 
 def optional(check: Check) -> Check:
-    """Accept None, too."""
+    """Also accept None."""
     return _or(check, lambda value: value is None, "None")
 
 
 def either(choice: str, check: Check) -> Check:
-    """Accept one word, too."""
+    """Also accept one word."""
     return _or(check, lambda value: isinstance(value, str) and value == choice, f'"{choice}"')
 
 
 def or_schedule(check: Check) -> Check:
-    """Accept a function of the progress that remains, too."""
+    """Also accept a function of the remaining progress."""
     return _or(check, callable, "a function")
 
 
 def or_infinity(check: Check) -> Check:
-    """Accept infinity, too."""
+    """Also accept infinity."""
     return lambda name, value: value if value == math.inf else check(name, value)
 
 
 def entropy_coefficient(name: str, value: Any) -> str | float:
-    """Accept a number of at least 0, ``"auto"``, or ``"auto_0.1"`` with a value to begin with."""
+    """Accept a number of at least 0, ``"auto"``, or ``"auto_0.1"`` with an initial value."""
     if not isinstance(value, str):
         return number(0)(name, value)
     word, mark, start = value.partition("_")
@@ -143,7 +143,7 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
-# Arguments of every algorithm that are no plain values.
+# Arguments of every algorithm that are not plain values.
 _FURTHER: dict[str, Check] = {
     "policy_kwargs": optional(mapping),
     "replay_buffer_kwargs": optional(mapping),

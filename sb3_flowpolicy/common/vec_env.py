@@ -1,4 +1,4 @@
-"""Environments with a batched form of their own, as SB3's VecEnv."""
+"""Batched environments as SB3's VecEnv."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import flowpolicy_envs  # noqa: F401, registers the environments
 def make_batched_env(
     env_id: str, n_envs: int = 1, seed: int | None = None, **env_kwargs: Any
 ) -> VecMonitor:
-    """Make many environments that one compiled call steps, for any SB3 algorithm.
+    """Make several environments that are stepped by one compiled call, for any SB3 algorithm.
 
     Args:
-        env_id: Id of an environment that brings a vectorized form, as all of ``flowpolicy_envs``.
+        env_id: Id of an environment with a vectorized form, such as any of ``flowpolicy_envs``.
         n_envs: Number of environments.
-        seed: Seed of the first; the others get those after it.
+        seed: Seed of the first environment; the others get the seeds after it.
         **env_kwargs: Arguments of the environment.
 
     Example:
@@ -43,7 +43,7 @@ def make_batched_env(
 
 
 class BatchedVecEnv(VecEnv):
-    """Gymnasium's ``VectorEnv``, if it resets in the same step, as SB3's ``VecEnv``."""
+    """SB3's ``VecEnv`` around gymnasium's ``VectorEnv`` that resets in the same step."""
 
     def __init__(self, venv: VectorEnv) -> None:
         mode = venv.metadata.get("autoreset_mode")
@@ -63,7 +63,7 @@ class BatchedVecEnv(VecEnv):
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Note the actions."""
+        """Store the actions."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -108,7 +108,7 @@ class BatchedVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each environment: none is wrapped on its own."""
+        """Return False for each environment: wrappers apply to the whole batch."""
         return [False for _ in self._get_indices(indices)]
 
 
