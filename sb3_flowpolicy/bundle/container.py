@@ -1,8 +1,8 @@
 """The file format: a safetensors file whose metadata hold a configuration and a checksum.
 
-The one metadata entry ``sb3_flowpolicy`` is a JSON object of ``config`` and ``sha256``, the
-checksum of the configuration and all arrays. A single entry, because safetensors writes several
-entries in random order, and equal models are to be equal files.
+The metadata have one entry, ``sb3_flowpolicy``: a JSON object with ``config`` and ``sha256``, the
+checksum of the configuration and all arrays. safetensors writes several entries in random order;
+with one entry, equal models give equal files.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Arrays = dict[str, np.ndarray]
 
 
 class BundleError(ValueError):
-    """A bundle that is refused; the message names the file, what was expected and what it has."""
+    """A bundle is invalid; the message names the file and says what was expected and found."""
 
 
 def write(path: Path, config: Any, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a file completely or not at all; ``config`` is what JSON can hold."""
+    """Write a file completely or not at all; ``config`` is JSON data."""
     # safetensors copies memory as it lies; ascontiguousarray would make scalars one-dimensional.
     plain = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     content = canonical({"config": config, "sha256": checksum(config, plain)})
@@ -42,9 +42,9 @@ def write(path: Path, config: Any, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read(path: Path) -> tuple[Any, Arrays]:
-    """Return configuration and arrays of a file, in memory of about its size.
+    """Return the configuration and the arrays of a file; takes about its size in memory.
 
-    Besides ``ValueError``, the libraries raise exceptions of their own for damaged files.
+    Besides ``ValueError``, damaged files raise exceptions of the libraries.
     """
     if not path.is_file():  # opening a named pipe would block
         raise ValueError("not a regular file that exists")
@@ -64,7 +64,7 @@ def read(path: Path) -> tuple[Any, Arrays]:
 
 
 def canonical(value: Any) -> str:
-    """Return the one JSON text of a value: sorted keys, ASCII, neither NaN nor infinity."""
+    """Return the canonical JSON of a value: sorted keys, ASCII, neither NaN nor infinity."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
@@ -78,7 +78,7 @@ def checksum(config: Any, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def tensor_like(expected: th.Tensor, name: str, arrays: Mapping[str, np.ndarray]) -> th.Tensor:
-    """Return an array as a tensor; it must have the type and shape that are expected."""
+    """Return an array as a tensor, after checking its type and shape."""
     found = th.from_numpy(arrays[name])
     if (found.dtype, found.shape) != (expected.dtype, expected.shape):
         raise ValueError(

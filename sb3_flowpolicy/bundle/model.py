@@ -1,4 +1,4 @@
-"""Save a model as a bundle, and build it again from a validated one."""
+"""Save a model as a bundle, and build a model from a validated bundle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sb3_flowpolicy.common.validation import Check, integer, number
 
 SUFFIX = ".safetensors"
 FORMAT = 1
-# Attributes that are not named like the constructor's argument.
+# Attributes with another name than the constructor's argument.
 _ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
 _PROGRESS: dict[str, Check] = {
     **dict.fromkeys(("num_timesteps", "_total_timesteps", "_num_timesteps_at_start"), integer(0)),
@@ -54,7 +54,7 @@ def save_bundle(model: SAC, path: str | Path, vec_normalize: VecNormalize | None
 def load_bundle(
     cls: type[Model], path: str | Path, env: Any = None, device: th.device | str = "auto"
 ) -> Model:
-    """Read a model without executing anything that the file names; see :meth:`SACFlow.load_safe`.
+    """Read a model without running code from the file; see :meth:`SACFlow.load_safe`.
 
     A file is accepted only if the model built from it would be saved with the same content.
     """
@@ -101,7 +101,7 @@ def made_with() -> dict[str, str]:
 
 
 def _describe(model: Any, statistics: VecNormalize | None) -> tuple[dict[str, Any], Arrays]:
-    """Return the configuration and the arrays that say everything about a model."""
+    """Return the configuration and the arrays that describe a model completely."""
     arrays: Arrays = {
         f"policy.{name}": value.detach().cpu().numpy()
         for name, value in model.policy.state_dict().items()
@@ -168,7 +168,7 @@ def _parse(
 def _check_content(
     config: dict[str, Any], arrays: Arrays, again: dict[str, Any], values: Arrays
 ) -> None:
-    """Check that a model holds everything in the file, and nothing was converted or left out."""
+    """Check that nothing in the file was converted or left out when the model was built."""
     keys = sorted((config.keys() | again.keys()) - {"made_with"})
     texts = [{key: container.canonical(one.get(key)) for key in keys} for one in (config, again)]
     differing = [key for key in keys if texts[0][key] != texts[1][key]]
@@ -183,7 +183,7 @@ def _check_content(
 
 @contextmanager
 def _refusing(path: Path) -> Iterator[None]:
-    """Turn all errors that a file's content causes, in torch and SB3 too, into BundleError."""
+    """Turn all errors that a file causes, also in torch and SB3, into ``BundleError``."""
     try:
         yield
     except Exception as error:

@@ -1,4 +1,4 @@
-"""``VecNormalize`` without environments: statistics to read, to share, and to wrap others with."""
+"""The statistics of ``VecNormalize`` without an environment: saved, loaded, and used again."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Spaces(gym.Env):
 
 
 class _Statistics(VecNormalize):
-    """Statistics of no environment, which can be pickled more than once."""
+    """Statistics without an environment, which can be pickled more than once."""
 
     def __getstate__(self) -> dict[str, Any]:
         bound = ("venv", "class_attributes", "returns")
@@ -61,7 +61,7 @@ def wrap(known: VecNormalize, env: VecEnv) -> VecNormalize:
 
 
 def obs_statistics(known: VecNormalize | None) -> dict[str, RunningMeanStd]:
-    """Return the statistics by observation key; the key is "" if observations are arrays."""
+    """Return the statistics by observation key, which is "" if observations are arrays."""
     found: Any = known.obs_rms if known is not None and known.norm_obs else {}
     return found if isinstance(found, dict) else {ONLY_KEY: found}
 

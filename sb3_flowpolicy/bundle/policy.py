@@ -1,4 +1,4 @@
-"""The policy as JSON: classes by name, from fixed lists, and their arguments as plain values."""
+"""The policy as JSON: names of classes, from fixed lists, and arguments as plain values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _by_name(*classes: type) -> dict[str, Any]:
     return {one.__name__: one for one in classes}
 
 
-# A name in a file is looked up here. Nothing is imported by name.
+# Names in a file are looked up here, never imported.
 _CLASSES = {
     "policy_class": _by_name(
         *(policies.FlowPolicy, policies.CnnFlowPolicy, policies.MultiInputFlowPolicy),
@@ -44,7 +44,7 @@ _CLASSES = {
 
 
 def name_of(argument: str, value: Any) -> str:
-    """Return the name of a class that a bundle may hold as this argument."""
+    """Return the name of a class, if a bundle may hold it as this argument."""
     known, name = _CLASSES[argument], getattr(value, "__name__", "")
     if known.get(name) is not value:
         raise ValueError(
@@ -75,7 +75,7 @@ def from_spec(spec: Mapping[str, Any]) -> dict[str, Any]:
         name: class_of(name, value) if name in _CLASSES else value for name, value in spec.items()
     }
     if kwargs.get("use_sde"):
-        # Its noise is drawn while the policy is built, which the meta device cannot do.
+        # Building such a policy draws noise, which the meta device cannot do.
         raise ValueError("use_sde must be False for a safe bundle, got True: use model.save()")
     return {"policy_class": kwargs.pop("policy_class"), "policy_kwargs": kwargs}
 
@@ -83,7 +83,7 @@ def from_spec(spec: Mapping[str, Any]) -> dict[str, Any]:
 def expected_parameters(attributes: Mapping[str, Any], n_arrays: int) -> dict[str, th.Tensor]:
     """Return the state dict of a model's policy on the meta device, which takes no memory.
 
-    The construction takes time, so it stops at more parameters than there are arrays.
+    Construction takes time, so it stops when there are more parameters than arrays.
     """
     policy_class, count = attributes["policy_class"], itertools.count(1)
     thread = threading.get_ident()

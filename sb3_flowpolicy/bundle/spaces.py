@@ -1,4 +1,4 @@
-"""Spaces as JSON, with the bounds of boxes as arrays: exact, infinities included."""
+"""Spaces as JSON, with the bounds of boxes as arrays, which hold infinities exactly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def to_spec(name: str, space: spaces.Space, arrays: Arrays) -> dict[str, Any]:
     """
     if isinstance(space, spaces.Dict):
         parts = enumerate(space.spaces.items())
-        # Pairs, because JSON objects have no order.
+        # Pairs keep the order of the keys; JSON objects have none.
         entries = [[key, to_spec(f"{name}.{i}", part, arrays)] for i, (key, part) in parts]
         return {"type": "Dict", "spaces": entries}
     if not isinstance(space, spaces.Box):

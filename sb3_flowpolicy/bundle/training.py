@@ -1,4 +1,4 @@
-"""What further training depends on as JSON and arrays: learning rate and optimizers."""
+"""Learning rate and optimizers as JSON and arrays, for further training."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def load_optimizer(name: str, optimizer: th.optim.Optimizer, spec: Any, arrays: 
         key: tuple(value) if key == "betas" else value for key, value in spec.items()
     }
     group.update(settings)
-    # A step on one number: torch checks the settings, and shows the entries of its state.
+    # A step on one number makes torch check the settings and create the entries of its state.
     scratch = th.zeros_like(group["params"][0].flatten()[:1], requires_grad=True)
     scratch.grad = th.zeros_like(scratch)
     probe = type(optimizer)([scratch], **settings)

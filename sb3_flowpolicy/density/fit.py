@@ -31,8 +31,8 @@ Weights = dict[str, th.Tensor]
 class Ensemble:
     """S copies of a model that differ in their weights only, evaluated together.
 
-    Stacked along a leading axis, ten small networks cost far less than ten times one. Models that
-    ``vmap`` cannot stack are evaluated one after the other, with the same result.
+    Ten small networks, stacked along a leading axis, cost far less than ten single ones. Models
+    that ``vmap`` cannot stack are evaluated one after the other, with the same result.
 
     Example:
         >>> ensemble = Ensemble("realnvp", condition_dim=0, seeds=[0, 1, 2])

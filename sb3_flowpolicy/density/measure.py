@@ -123,9 +123,9 @@ def integral(log_prob: LogProb, condition: th.Tensor, cells: int) -> float:
 
     .. math:: \int p(x)\,dx = \int p(\sinh u) \cosh u_1 \cosh u_2\, du
 
-    With 700 cells per axis, those near the origin, where the data lie, are as narrow as a quarter
-    of the data's noise. The integral reveals a wrong log-determinant, and mass that a flow loses
-    because one of its layers does not reach the whole plane. The condition has the shape (C,).
+    With 700 cells per axis, the cells near the origin, where the data lie, are a quarter of the
+    data's noise wide. The integral reveals a wrong log-determinant, and mass that a flow loses
+    because one of its layers does not reach the whole plane. The condition has shape (C,).
 
     Example:
         >>> from sb3_flowpolicy.density.models import make_model

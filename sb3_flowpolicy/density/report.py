@@ -1,4 +1,4 @@
-"""A page with each figure, the thesis's finding about it, and the checks of its claims."""
+"""A page with the tables, the figures, the thesis's findings, and the checks of its claims."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The studies of the chapter, each with the thesis's findings."""
+"""The studies of the chapter, with the findings of the thesis."""
 
 from __future__ import annotations
 

@@ -48,15 +48,14 @@ _TEXT_FORMATS = ("stdout", "log", "json", "csv")
 class PolicyDiagnosticsCallback(BaseCallback):
     """Log entropy, standard deviation, correlation and value of the policy's actions.
 
-    Measured at states of the replay buffer. The callback does not consume the run's random
-    numbers, so a run is the same with and without it. Its dashboard on TensorBoard's custom-scalars
-    page also shows the return and success rate that SB3 and ``EvalCallback`` log. The TensorBoard
-    guide lists the keys.
+    The callback measures at states of the replay buffer with its own random numbers, so a run is
+    the same with and without it. Its dashboard on TensorBoard's custom-scalars page also shows the
+    return and success rate that SB3 and ``EvalCallback`` log. The TensorBoard guide lists the keys.
 
     Args:
         log_freq: Environment steps between two measurements, at least 1.
-        image_freq: Environment steps between two sets of pictures, which are measured, too; 0 draws
-            none.
+        image_freq: Environment steps between two sets of pictures, each with a measurement; 0
+            for no pictures.
         n_states: Number of states, at least 1.
         n_samples: Number of actions per state, at least 2.
 

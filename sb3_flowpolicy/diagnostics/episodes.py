@@ -47,8 +47,8 @@ def episode_frames(
     """Play one episode and render it with samples of the policy's actions.
 
     ``env`` is one vectorized environment with the render mode ``rgb_array`` and a method
-    ``set_action_samples``, as those of ``flowpolicy_envs`` have. ``deterministic`` concerns the
-    actions that are taken; samples are always drawn with exploration.
+    ``set_action_samples``, as in ``flowpolicy_envs``. ``deterministic`` applies to the actions
+    that are taken; the samples always include exploration.
 
     Returns:
         One picture (size, size, 3) per step, rendered before its action.
@@ -77,7 +77,7 @@ def rollout_figure(
 
 
 def sequence_figure(frames: Sequence[np.ndarray], first: int, n_steps: int) -> Figure:
-    """Draw ``n_steps`` steps of an episode side by side, from step ``first`` on, counted from 0."""
+    """Draw ``n_steps`` steps of an episode side by side, from step ``first``, counted from 0."""
     return _panels(frames, range(first, first + n_steps), 2.4, 2.6)
 
 

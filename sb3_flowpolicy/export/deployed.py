@@ -1,4 +1,4 @@
-"""The whole path from raw observations to actions as one module of tensors."""
+"""The path from raw observations to actions as one module."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class DeployedPolicy(nn.Module):
         self, policy: DistributionPolicy, normalization: VecNormalize | None, stochastic: bool
     ) -> None:
         super().__init__()
-        # A copy, as it is moved to the CPU and set to evaluation mode.
+        # A copy, because it is moved to the CPU and set to evaluation mode.
         self.actor: FlowActor = copy.deepcopy(policy.actor)
         self.stochastic = stochastic
         self.keys = list(parts_of(policy.observation_space))
@@ -85,7 +85,7 @@ def expected_actions(
     stochastic: bool,
     inputs: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
-    """Return the model's own actions for inputs as :func:`random_inputs` draws them."""
+    """Return the model's actions for inputs from :func:`random_inputs`."""
     space = policy.observation_space
     obs: Any = inputs[0]
     if isinstance(space, spaces.Dict):
