@@ -21,13 +21,13 @@ class AdamSettings:
     decoupled: bool
 
 
-def adam_settings(optimizer: th.optim.Optimizer) -> AdamSettings | None:
+def adam_settings(optimizer: th.optim.Optimizer | None) -> AdamSettings | None:
     """Return the settings of a plain Adam or AdamW, None for any other optimizer."""
-    if type(optimizer) not in (th.optim.Adam, th.optim.AdamW) or len(optimizer.param_groups) != 1:
+    if optimizer is None or type(optimizer) not in (th.optim.Adam, th.optim.AdamW):
         return None
-    group = optimizer.param_groups[0]
+    group, *others = optimizer.param_groups
     decay = group["weight_decay"]
-    if group["amsgrad"] or group["maximize"] or not isinstance(decay, float | int):
+    if others or group["amsgrad"] or group["maximize"] or not isinstance(decay, float | int):
         return None
     beta1, beta2 = group["betas"]
     return AdamSettings(beta1, beta2, group["eps"], decay, type(optimizer) is th.optim.AdamW)
@@ -64,9 +64,6 @@ class FlatAdam:
     """Moments of S optimizers as tensors (S, P); the optimizers' own states become views."""
 
     def __init__(self, flat: FlatParameters, optimizers: list[th.optim.Optimizer]) -> None:
-        settings = adam_settings(optimizers[0])
-        assert settings is not None
-        self.settings = settings
         self.flat = flat
         self.optimizers = optimizers
         self.bind()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_flowpolicy.engine.adam import FlatAdam
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
@@ -19,15 +19,13 @@ from sb3_flowpolicy.engine.update import LOSSES, Batch, TrainState, UpdateSettin
 from sb3_flowpolicy.policies import FlowActor
 
 
-def settings_key(model: Any) -> tuple[object, ...]:
-    """Return all constants of an update, for a quick comparison."""
+def update_settings(model: Any) -> UpdateSettings:
+    """Return the constants that are compiled into a model's update."""
     optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
-    groups = [optimizer.param_groups[0] for optimizer in optimizers if optimizer is not None]
-    names = ("betas", "eps", "weight_decay", "amsgrad", "maximize")
-    adam = [group.get(name) for group in groups for name in names]
+    adams: list[Any] = [adam_settings(optimizer) for optimizer in optimizers]
     objective = model.objective()
     constants = objective.layer_constants(model.policy)
-    return (objective, model.tau, model.target_entropy, *adam, *constants)
+    return UpdateSettings(objective, constants, model.tau, float(model.target_entropy), *adams)
 
 
 class Engine(BoundEngine):
@@ -40,7 +38,8 @@ class Engine(BoundEngine):
         super().__init__(models, compiled)
         first = self.models[0]
         self.autocast = first.autocast
-        self.objective = first.objective()
+        self.settings = update_settings(first)
+        self.objective = self.settings.objective
         policies = [model.policy for model in self.models]
         self.networks = self.objective.networks_type(policies, self.autocast)
         self.actor_adam = FlatAdam(
@@ -61,23 +60,13 @@ class Engine(BoundEngine):
             optimizers = [model.ent_coef_optimizer for model in self.models]
             self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)
             self.parts += [self.log_ent_coef, self.ent_coef_adam]
-        settings = UpdateSettings(
-            tau=first.tau,
-            target_entropy=float(first.target_entropy),
-            actor_adam=self.actor_adam.settings,
-            critic_adam=self.critic_adam.settings,
-            ent_coef_adam=None if self.ent_coef_adam is None else self.ent_coef_adam.settings,
-        )
-        self._key = settings_key(first)
-        places = [place for model in self.models for place in _places(model)]
-        things = [home[name] for home, name in places]
-        self._note(places, [thing for thing in things if isinstance(thing, th.Tensor)])
+        self._note([place for model in self.models for place in _places(model)])
         networks, device = self.networks, self.networks.actor.data.device
 
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
             return networks.sample(actor, obs, noise)[0]
 
-        self._update = self.objective.make_update(networks, settings)
+        self._update = self.objective.make_update(networks, self.settings)
         self._compiled_update = Compiled(self._update, f"the {self.objective.name} update", device)
         self._sample = sample
         self._compiled_sample = Compiled(sample, "the policy", device)
@@ -86,9 +75,6 @@ class Engine(BoundEngine):
         #: Names of the losses to log of the last :meth:`train`.
         self.logged: tuple[str, ...] = LOSSES
         self._rows: ReplayRows | None = None
-        self._grouped: tuple[int, list[tuple[slice, TrainState]]] | None = None
-        self._fixed: list[tuple[th.Tensor, int]] = []
-        self._learning_rates: tuple[list[float], th.Tensor] | None = None
 
     @staticmethod
     def why_unsupported(model: Any) -> str | None:
@@ -123,22 +109,8 @@ class Engine(BoundEngine):
     def fits(self) -> bool:
         """Whether the models have the same networks, optimizers and constants as at the start."""
         first = self.models[0]
-        same = self.autocast == first.autocast and self._key == settings_key(first)
-        return same and self._has_same_things()
-
-    def synchronize(self) -> bool:
-        """Take over what was loaded or moved since the last update; return whether anything was."""
-        # A fixed entropy coefficient may be replaced between two calls, or changed in place.
-        fixed = [(tensor, tensor._version) for tensor in self._fixed_ent_coefs()]
-        if len(fixed) != len(self._fixed) or any(
-            now is not then or version != before
-            for (now, version), (then, before) in zip(fixed, self._fixed, strict=True)
-        ):
-            self._grouped, self._fixed = None, fixed
-        changed = super().synchronize()
-        if changed:
-            self._grouped = None
-        return changed
+        same = self.autocast == first.autocast and self._has_same_things()
+        return same and self.settings == update_settings(first)
 
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
@@ -169,15 +141,12 @@ class Engine(BoundEngine):
             noise = self.networks.actor.data.new_zeros(shape)
         return self.act(rows, noise).squeeze(0).cpu().numpy()
 
-    def _fixed_ent_coefs(self) -> list[th.Tensor]:
-        return [] if self.log_ent_coef else [model.ent_coef_tensor for model in self.models]
-
     def state(self) -> TrainState:
         """Return what an update of all seeds changes."""
         if self.log_ent_coef is not None:
             ent_coef = self.log_ent_coef.data
         else:
-            ent_coef = th.stack([tensor.reshape(1) for tensor in self._fixed_ent_coefs()])
+            ent_coef = th.stack([model.ent_coef_tensor.reshape(1) for model in self.models])
         return TrainState(
             self.networks.actor.data,
             self.networks.critic.data,
@@ -190,13 +159,12 @@ class Engine(BoundEngine):
 
     def _groups(self, batch_size: int) -> list[tuple[slice, TrainState]]:
         """Return the seeds that are updated together, and what an update of them changes."""
-        if self._grouped is None or self._grouped[0] != batch_size:
-            state, count = self.state(), len(self.models)
-            size = seeds_at_once(self.models[0].critic, count, batch_size)
-            slices = [slice(start, start + size) for start in range(0, count, size)]
-            groups = [(seeds, state if size == count else state.of(seeds)) for seeds in slices]
-            self._grouped = batch_size, groups
-        return self._grouped[1]
+        state, count = self.state(), len(self.models)
+        size = seeds_at_once(self.models[0].critic, count, batch_size)
+        if size == count:
+            return [(slice(count), state)]
+        slices = [slice(start, start + size) for start in range(0, count, size)]
+        return [(seeds, state.of(seeds)) for seeds in slices]
 
     def draw(self, n_updates: int, batch_size: int) -> list[Batch]:
         """Draw minibatches and noise for ``n_updates`` updates at once."""
@@ -232,10 +200,8 @@ class Engine(BoundEngine):
         third = first.ent_coef_optimizer or first.actor.optimizer
         optimizers = (first.actor.optimizer, first.critic.optimizer, third)
         rates = [optimizer.param_groups[0]["lr"] for optimizer in optimizers]
-        if self._learning_rates is None or self._learning_rates[0] != rates:
-            device = self.networks.actor.data.device
-            self._learning_rates = rates, th.tensor(rates, dtype=th.float64, device=device)
-        learning_rates = self._learning_rates[1]
+        device = self.networks.actor.data.device
+        learning_rates = th.tensor(rates, dtype=th.float64, device=device)
         groups = self._groups(batches[0].rewards.shape[1])
         history = self.history = []
         flags = [self.objective.is_due(first, k, start) for k in range(len(batches))]

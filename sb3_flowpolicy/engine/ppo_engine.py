@@ -35,18 +35,15 @@ class PPOEngine(BoundEngine):
         (model,) = models
         policy = model.policy
         assert isinstance(policy, DensityActorCritic)
-        self.model, self.policy, self.optimizer = model, policy, policy.optimizer
+        self.model, self.policy = model, policy
         names = {f"module.{name}": [value] for name, value in policy.named_parameters()}
         self.flat = FlatParameters([names])
         self.adam = FlatAdam(self.flat, [policy.optimizer])
         self.parts = [self.flat, self.adam]
-        places: list[Place] = [
-            (module._parameters, name)
-            for module in policy.modules()
-            for name, parameter in module._parameters.items()
-            if parameter is not None
-        ]
-        self._note(places, [next(policy.parameters())])
+        places: list[Place] = [(vars(model), "policy"), (vars(policy), "optimizer")]
+        for module in policy.modules():
+            places += [(module._parameters, name) for name in module._parameters]
+        self._note(places)
         self.settings = _settings(model)
         device = self.flat.data.device
         self._eager_update = make_ppo_update(policy, self.flat, self.settings)
@@ -66,10 +63,8 @@ class PPOEngine(BoundEngine):
 
     def fits(self) -> bool:
         """Whether the model still has the same policy, optimizer and constants."""
-        model = self.model
-        same = model.policy is self.policy and self.policy.optimizer is self.optimizer
-        same = same and self._has_same_things()
-        return same and self.why_unsupported(model) is None and self.settings == _settings(model)
+        supported = self._has_same_things() and self.why_unsupported(self.model) is None
+        return supported and self.settings == _settings(self.model)
 
     @contextmanager
     def collecting(self, watched: bool = True) -> Iterator[None]:
@@ -118,7 +113,7 @@ class PPOEngine(BoundEngine):
             ValueError: If a log-probability is not finite: that minibatch changed nothing.
         """
         model, target_kl = self.model, self.settings.target_kl
-        rate = self.optimizer.param_groups[0]["lr"]
+        rate = self.policy.optimizer.param_groups[0]["lr"]
         scalars = th.tensor([rate, clip_range, clip_range_vf], dtype=th.float64)
         scalars = scalars.to(self.flat.data.device)
         state = PPOState(self.flat.data, self.adam.moments)

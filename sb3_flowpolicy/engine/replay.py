@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -81,7 +80,8 @@ class ReplayRows:
             obs, next_obs = (part.unflatten(-1, self.obs_shape) for part in (obs, next_obs))
         # A time limit does not end the task: the value of the last state is bootstrapped.
         ends = (dones * (1 - timeouts)).squeeze(-1)
-        discounts = _constant(gamma, tuple(index.shape[1:]), noise.dtype, noise.device)
+        # In float32, as SB3's buffers hold them, also for networks of another type.
+        discounts = th.full(index.shape[1:], gamma, device=noise.device).to(noise.dtype)
         rewards = rewards.squeeze(-1)
         return [
             Batch(obs[k], actions[k], next_obs[k], ends[k], rewards[k], discounts, noise[k])
@@ -96,13 +96,9 @@ def draw_index(buffers: Sequence[ReplayBuffer], n_updates: int, batch_size: int)
     width = sum(buffer.n_envs for buffer in buffers)
     index = np.empty((n_updates, len(buffers), batch_size), np.int64)
     for seed, buffer in enumerate(buffers):
-        first = seed * buffer.n_envs
-        if buffer.n_envs == 1:  # one call draws the same numbers as many
-            index[:, seed] = draw(0, buffer.size(), size=(n_updates, batch_size)) * width + first
-            continue
         for k in range(n_updates):
-            rows = draw(0, buffer.size(), size=batch_size)
-            index[k, seed] = rows * width + first + draw(0, buffer.n_envs, size=batch_size)
+            rows, envs = (draw(0, most, size=batch_size) for most in (buffer.size(), buffer.n_envs))
+            index[k, seed] = rows * width + seed * buffer.n_envs + envs
     return th.from_numpy(index)
 
 
@@ -150,11 +146,3 @@ def _filled_rows_only(buffer: ReplayBuffer) -> Iterator[None]:
         yield
     finally:
         buffer.ep_length = lengths
-
-
-@lru_cache(maxsize=8)
-def _constant(
-    value: float, shape: tuple[int, ...], dtype: th.dtype, device: th.device
-) -> th.Tensor:
-    # SB3's buffers hold rewards and discounts in float32, also for networks of another type.
-    return th.full(shape, value, device=device).to(dtype)

@@ -38,8 +38,7 @@ class BoundEngine(ABC):
     def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
         self.models = list(models)
         self.compiled = compiled
-        self._things: list[tuple[Mapping[str, Any], str, Any]] = []
-        self._kinds: list[tuple[th.Tensor, object]] = []
+        self._things: list[tuple[Mapping[str, Any], str, Any, object]] = []
 
     @staticmethod
     @abstractmethod
@@ -50,17 +49,16 @@ class BoundEngine(ABC):
     def fits(self) -> bool:
         """Whether the models have the same networks, optimizers and constants as at the start."""
 
-    def _note(self, places: Sequence[Place], probes: Sequence[th.Tensor]) -> None:
-        """Note what is bound: objects by where they are, and tensors by type and device."""
-        self._things = [(home, name, home[name]) for home, name in places]
-        self._kinds = [(tensor, _kind(tensor)) for tensor in probes]
+    def _note(self, places: Sequence[Place]) -> None:
+        """Note what is bound: objects by where they are, and tensors also by type and device."""
+        self._things = [(home, name, home[name], _kind(home[name])) for home, name in places]
 
     def _has_same_things(self) -> bool:
         """Whether none of what was noted was replaced, frozen or moved."""
-        for home, name, thing in self._things:
-            if home[name] is not thing:
+        for home, name, thing, kind in self._things:  # noqa: SIM110 - takes half the time
+            if home[name] is not thing or _kind(thing) != kind:
                 return False
-        return all(_kind(tensor) == kind for tensor, kind in self._kinds)
+        return True
 
     def synchronize(self) -> bool:
         """Take over what was loaded or moved since the last update; return whether anything was."""
@@ -76,8 +74,8 @@ class BoundEngine(ABC):
             part.release()
 
 
-def _kind(tensor: th.Tensor) -> object:
-    return tensor.requires_grad, tensor.dtype, tensor.device
+def _kind(thing: Any) -> object:
+    return isinstance(thing, th.Tensor) and (thing.requires_grad, thing.dtype, thing.device)
 
 
 def why_network_unsupported(network: Any) -> str | None:

@@ -64,6 +64,8 @@ LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 class UpdateSettings:
     """Constants of an update: they are compiled into it."""
 
+    objective: Objective
+    layer_constants: tuple[object, ...]
     tau: float
     target_entropy: float
     actor_adam: AdamSettings

@@ -19,7 +19,7 @@ from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_c
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.common.vec_env import info_of
-from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, settings_key
+from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, update_settings
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.experience import SeedExperience
 from sb3_flowpolicy.seeds.setup import EnvFactory, check_seeds, check_stackable, make_env, refuse
@@ -328,7 +328,7 @@ class SeedBatch:
 
 def _shared_settings(model: EngineFlow) -> tuple[object, ...]:
     return (
-        settings_key(model),
+        update_settings(model),
         *(getattr(model, name, None) for name in _COMMON),
         *(model.lr_schedule(left) for left in _SCHEDULE_AT),
     )
