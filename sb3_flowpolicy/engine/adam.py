@@ -33,21 +33,6 @@ def adam_settings(optimizer: th.optim.Optimizer | None) -> AdamSettings | None:
     return AdamSettings(beta1, beta2, group["eps"], decay, type(optimizer) is th.optim.AdamW)
 
 
-def why_optimizer_unsupported(optimizer: th.optim.Optimizer, network: th.nn.Module) -> str | None:
-    """Return what about a network's optimizer the engines do not support, None if nothing."""
-    if adam_settings(optimizer) is None:
-        return f"optimizer of type {type(optimizer).__name__} with these settings"
-    if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
-        return "optimizer with hooks"
-    owners = optimizer.param_groups[0]["params"]
-    if set(map(id, owners)) != set(map(id, network.parameters())):
-        return "optimizer of other parameters than the network's"
-    states = [optimizer.state.get(owner, {}) for owner in owners]
-    if len({float(state.get("step", 0)) for state in states}) > 1:
-        return "optimizer of which a part was reset"
-    return None
-
-
 # Names of an optimizer's own entries.
 _KEYS = ("step", "exp_avg", "exp_avg_sq")
 

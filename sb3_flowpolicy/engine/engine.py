@@ -7,25 +7,16 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 
 from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
 from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
-from sb3_flowpolicy.engine.observations import why_space_unsupported
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
 from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
 from sb3_flowpolicy.engine.update import LOSSES, Batch, TrainState, UpdateSettings
 from sb3_flowpolicy.policies import FlowActor
-
-
-def update_settings(model: Any) -> UpdateSettings:
-    """Return the constants that are compiled into a model's update."""
-    optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
-    adams: list[Any] = [adam_settings(optimizer) for optimizer in optimizers]
-    objective = model.objective()
-    constants = objective.layer_constants(model.policy)
-    return UpdateSettings(objective, constants, model.tau, float(model.target_entropy), *adams)
 
 
 class Engine(BoundEngine):
@@ -37,11 +28,9 @@ class Engine(BoundEngine):
     def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
         super().__init__(models, compiled)
         first = self.models[0]
-        self.autocast = first.autocast
-        self.settings = update_settings(first)
-        self.objective = self.settings.objective
+        self.objective = first.objective()
         policies = [model.policy for model in self.models]
-        self.networks = self.objective.networks_type(policies, self.autocast)
+        self.networks = self.objective.networks_type(policies, first.autocast)
         self.actor_adam = FlatAdam(
             self.networks.actor, [policy.actor.optimizer for policy in policies]
         )
@@ -86,9 +75,10 @@ class Engine(BoundEngine):
             return f"actor of type {type(policy.actor).__name__}"
         if type(policy.critic) is not objective.critic_type:
             return f"critic of type {type(policy.critic).__name__}"
-        reason = why_space_unsupported(model.observation_space)
-        if reason is not None:
-            return reason
+        space = model.observation_space
+        parts = space.values() if isinstance(space, spaces.Dict) else [space]
+        if not all(part.shape for part in parts):
+            return f"observation space {space}"
         if _has_tensors(policy.critic.features_extractor):
             return "features extractor with parameters or buffers"
         for network in policy.critic.q_networks:
@@ -101,16 +91,24 @@ class Engine(BoundEngine):
                 return reason
         return objective.why_unsupported(policy)
 
+    @staticmethod
+    def settings_of(model: Any) -> UpdateSettings:
+        """Return the constants of a model's update."""
+        optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
+        objective = model.objective()
+        return UpdateSettings(
+            objective,
+            objective.layer_constants(model.policy),
+            model.autocast,
+            model.tau,
+            float(model.target_entropy),
+            *map(adam_settings, optimizers),  # type: ignore[arg-type]
+        )
+
     def _runs_compiled(self) -> bool:
         """Whether to call compiled functions: not after one could not be compiled."""
         eager = self._compiled_update.eager or self._compiled_sample.eager
         return self.compiled and not eager
-
-    def fits(self) -> bool:
-        """Whether the models have the same networks, optimizers and constants as at the start."""
-        first = self.models[0]
-        same = self.autocast == first.autocast and self._has_same_things()
-        return same and self.settings == update_settings(first)
 
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:

@@ -32,8 +32,9 @@ class FlatParameters:
     """
 
     def __init__(self, layouts: Sequence[Layout], copies: bool = False) -> None:
-        self.layouts = [{name: list(parts) for name, parts in one.items()} for one in layouts]
-        first = self.layouts[0]
+        #: The parameters of each seed.
+        self.owners = [[part for parts in one.values() for part in parts] for one in layouts]
+        first = layouts[0]
         self.names = list(first)
         self.shapes = [
             (len(parts), *parts[0].shape) if copies else tuple(parts[0].shape)
@@ -42,26 +43,21 @@ class FlatParameters:
         self.sizes = [sum(part.numel() for part in parts) for parts in first.values()]
         self.bind()
 
-    def _owners(self, seed: int) -> list[nn.Parameter]:
-        return [part for parts in self.layouts[seed].values() for part in parts]
-
     def views(self, flat: th.Tensor, seed: int) -> list[tuple[nn.Parameter, th.Tensor]]:
         """Pair each parameter of a seed with its part of ``flat`` (S, P), in its own shape."""
-        owners = self._owners(seed)
+        owners = self.owners[seed]
         parts = flat[seed].split([owner.numel() for owner in owners])
         return [(owner, part.view(owner.shape)) for owner, part in zip(owners, parts, strict=True)]
 
     def bind(self) -> None:
         """Gather the parameters' present values and make them views of :attr:`data`."""
-        seeds = range(len(self.layouts))
-        self.data = th.stack(
-            [th.cat([owner.detach().flatten() for owner in self._owners(seed)]) for seed in seeds]
-        )
-        for seed in seeds:
+        rows = [th.cat([owner.detach().flatten() for owner in owners]) for owners in self.owners]
+        self.data = th.stack(rows)
+        self._addresses = []
+        for seed in range(len(rows)):
             for owner, view in self.views(self.data, seed):
                 owner.data = view
-        owners = [owner for seed in seeds for owner in self._owners(seed)]
-        self._addresses = [(owner, owner.data_ptr()) for owner in owners]
+                self._addresses.append((owner, view.data_ptr()))
 
     def is_bound(self) -> bool:
         """Whether the parameters are still views: moving or reassigning a module undoes it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch as th
@@ -52,14 +53,12 @@ class StackedNetworks:
         """
         parameters = self.actor.unflatten(actor)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
-            actions, log_prob = per_seed(self._sample_one, parameters, obs, noise)
+            sample = partial(functional_call, self._sampler)
+            actions, log_prob = per_seed(sample, parameters, (obs, noise))
         return actions.to(actor.dtype), log_prob.to(actor.dtype)
 
     def _action_log_prob(self, obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         return self._actor.action_log_prob(self.observations.unpack(obs), noise)
-
-    def _sample_one(self, parameters: Tensors, obs: th.Tensor, noise: th.Tensor) -> Any:
-        return functional_call(self._sampler, parameters, (obs, noise))
 
     def q_values(
         self,

@@ -10,12 +10,6 @@ import torch as th
 from gymnasium import spaces
 
 
-def why_space_unsupported(space: spaces.Space) -> str | None:
-    """Return an observation space that cannot be rows of numbers, in words; None for others."""
-    parts = space.values() if isinstance(space, spaces.Dict) else [space]
-    return None if all(part.shape for part in parts) else f"observation space {space}"
-
-
 class Observations:
     """Converts observations of a space between SB3's form and one tensor.
 

@@ -44,13 +44,13 @@ class PPOEngine(BoundEngine):
         for module in policy.modules():
             places += [(module._parameters, name) for name in module._parameters]
         self._note(places)
-        self.settings = _settings(model)
         device = self.flat.data.device
         self._eager_update = make_ppo_update(policy, self.flat, self.settings)
         self._update = Compiled(self._eager_update, "the PPO update", device)
         act = policy_function(policy, self.flat, "sample_and_score")
         self._act = Compiled(act, "the policy", device)
         self._update.eager = self._act.eager = not compiled
+        self._is_watched = True
 
     @staticmethod
     def why_unsupported(model: PPO) -> str | None:
@@ -61,16 +61,24 @@ class PPOEngine(BoundEngine):
             return f"rollout buffer of type {type(model.rollout_buffer).__name__}"
         return why_network_unsupported(model.policy)
 
-    def fits(self) -> bool:
-        """Whether the model still has the same policy, optimizer and constants."""
-        supported = self._has_same_things() and self.why_unsupported(self.model) is None
-        return supported and self.settings == _settings(self.model)
+    @staticmethod
+    def settings_of(model: PPO) -> PPOSettings:
+        """Return the constants of a model's update."""
+        return PPOSettings(
+            adam_settings(model.policy.optimizer),  # type: ignore[arg-type]
+            model.ent_coef,
+            model.vf_coef,
+            model.max_grad_norm,
+            model.normalize_advantage,
+            model.clip_range_vf is not None,
+            model.target_kl,
+        )
 
     @contextmanager
     def collecting(self, watched: bool = True) -> Iterator[None]:
         """Let the policy's ``forward`` run compiled, ``watched`` if callbacks may change it."""
-        forward = self._act_watched if watched else self.act
-        self.policy.forward = forward  # type: ignore[method-assign]
+        self._is_watched = watched
+        self.policy.forward = self.act  # type: ignore[method-assign]
         try:
             yield
         finally:
@@ -81,22 +89,17 @@ class PPOEngine(BoundEngine):
         self, obs: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Return actions, values and log-probabilities, as the policy's ``forward`` does."""
-        if deterministic:
+        # An engine for the policy as it is now follows at the next rollout.
+        is_outdated = self._is_watched and not self._has_same_things()
+        if deterministic or is_outdated:
             return type(self.policy).forward(self.policy, obs, deterministic)
+        if self._is_watched:
+            self.synchronize()
         noise = self.policy.draw_noise(len(obs))
         key = (obs.shape, obs.dtype)
         actions, values, log_prob = self._act(key, self.flat.data, obs, noise)
         check_finite(actions.cpu().numpy())
         return actions, values, log_prob
-
-    def _act_watched(
-        self, obs: th.Tensor, deterministic: bool = False
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Act with the parameters that the policy has now."""
-        if not self._has_same_things():  # a new engine follows at the next rollout
-            return type(self.policy).forward(self.policy, obs, deterministic)
-        self.synchronize()
-        return self.act(obs, deterministic)
 
     def train(self, clip_range: float, clip_range_vf: float) -> dict[str, list[float]]:
         """Do the updates of one rollout.
@@ -149,17 +152,3 @@ class PPOEngine(BoundEngine):
         if len(samples.actions) < self.model.batch_size:
             return self._eager_update(state, batch, scalars)
         return self._update(len(samples.actions), state, batch, scalars)
-
-
-def _settings(model: PPO) -> PPOSettings:
-    adam = adam_settings(model.policy.optimizer)
-    assert adam is not None
-    return PPOSettings(
-        adam,
-        model.ent_coef,
-        model.vf_coef,
-        model.max_grad_norm,
-        model.normalize_advantage,
-        model.clip_range_vf is not None,
-        model.target_kl,
-    )

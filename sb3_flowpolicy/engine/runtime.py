@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 import torch as th
 from torch import nn
 
-from sb3_flowpolicy.engine.adam import FlatAdam, why_optimizer_unsupported
+from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
 from sb3_flowpolicy.engine.arithmetic import flushed_subnormals, threads_for
 from sb3_flowpolicy.engine.flat import FlatParameters
 
@@ -38,6 +38,7 @@ class BoundEngine(ABC):
     def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
         self.models = list(models)
         self.compiled = compiled
+        self.settings = self.settings_of(self.models[0])
         self._things: list[tuple[Mapping[str, Any], str, Any, object]] = []
 
     @staticmethod
@@ -45,9 +46,14 @@ class BoundEngine(ABC):
     def why_unsupported(model: Any) -> str | None:
         """Return which part of a model the engine does not support, or None."""
 
+    @staticmethod
     @abstractmethod
+    def settings_of(model: Any) -> Any:
+        """Return the constants of a model's update, which are compiled into it."""
+
     def fits(self) -> bool:
         """Whether the models have the same networks, optimizers and constants as at the start."""
+        return self._has_same_things() and self.settings == self.settings_of(self.models[0])
 
     def _note(self, places: Sequence[Place]) -> None:
         """Note what is bound: objects by where they are, and tensors also by type and device."""
@@ -55,7 +61,7 @@ class BoundEngine(ABC):
 
     def _has_same_things(self) -> bool:
         """Whether none of what was noted was replaced, frozen or moved."""
-        for home, name, thing, kind in self._things:  # noqa: SIM110 - takes half the time
+        for home, name, thing, kind in self._things:
             if home[name] is not thing or _kind(thing) != kind:
                 return False
         return True
@@ -86,7 +92,17 @@ def why_network_unsupported(network: Any) -> str | None:
     for parameter in network.parameters():
         if not parameter.requires_grad or parameter._backward_hooks:
             return "parameters that are frozen or have hooks"
-    return why_optimizer_unsupported(network.optimizer, network)
+    optimizer = network.optimizer
+    if adam_settings(optimizer) is None:
+        return f"optimizer of type {type(optimizer).__name__} with these settings"
+    if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
+        return "optimizer with hooks"
+    owners = optimizer.param_groups[0]["params"]
+    if set(map(id, owners)) != set(map(id, network.parameters())):
+        return "optimizer of other parameters than the network's"
+    if len({float(optimizer.state.get(owner, {}).get("step", 0)) for owner in owners}) > 1:
+        return "optimizer of which a part was reset"
+    return None
 
 
 EngineT = TypeVar("EngineT", bound=BoundEngine)

@@ -49,11 +49,13 @@ class Batch(NamedTuple):
 
     def columns(self, seed: int) -> dict[str, np.ndarray]:
         """Return one seed's observations, actions, rewards and next observations, (B, ...)."""
-        names = {"observations": "obs", "next_observations": "next_obs"}
-        return {
-            column: getattr(self, names.get(column, column))[seed].detach().cpu().numpy()
-            for column in ("observations", "actions", "rewards", "next_observations")
+        columns = {
+            "observations": self.obs,
+            "actions": self.actions,
+            "rewards": self.rewards,
+            "next_observations": self.next_obs,
         }
+        return {name: column[seed].cpu().numpy() for name, column in columns.items()}
 
 
 LOSSES = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
@@ -66,6 +68,7 @@ class UpdateSettings:
 
     objective: Objective
     layer_constants: tuple[object, ...]
+    autocast: bool
     tau: float
     target_entropy: float
     actor_adam: AdamSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -19,13 +19,15 @@ from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_c
 from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.common.vec_env import info_of
-from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime, update_settings
+from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.experience import SeedExperience
 from sb3_flowpolicy.seeds.setup import EnvFactory, check_seeds, check_stackable, make_env, refuse
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 CallbackFactory = Callable[[int], BaseCallback]
-SelfBatch = TypeVar("SelfBatch", bound="SeedBatch")
 
 # What agents must agree on, besides the constants of their updates.
 _COMMON = (
@@ -103,13 +105,13 @@ class SeedBatch:
 
     @classmethod
     def resume(
-        cls: type[SelfBatch],
+        cls,
         path: str | Path,
         env: str | EnvFactory,
         algorithm: type[EngineFlow] = SACFlow,
         monitor_dir: str | Path | None = None,
         info_keywords: Sequence[str] = (),
-    ) -> SelfBatch:
+    ) -> Self:
         """Resume a batch from its newest undamaged checkpoint, as :meth:`SACFlow.resume` does.
 
         Args:
@@ -146,7 +148,7 @@ class SeedBatch:
         progress_bar: bool = False,
         checkpoint_every: int | None = None,
         checkpoint_path: str | Path | None = None,
-    ) -> SeedBatch:
+    ) -> Self:
         """Train all agents; the arguments are those of :meth:`SACFlow.learn`.
 
         Args:
@@ -328,7 +330,7 @@ class SeedBatch:
 
 def _shared_settings(model: EngineFlow) -> tuple[object, ...]:
     return (
-        update_settings(model),
+        Engine.settings_of(model),
         *(getattr(model, name, None) for name in _COMMON),
         *(model.lr_schedule(left) for left in _SCHEDULE_AT),
     )
