@@ -113,7 +113,7 @@ class PolicyDiagnosticsCallback(BaseCallback):
         was_training = self.model.policy.training
         self.model.policy.set_training_mode(False)
         context = actor.context(obs)
-        noise = actor.draw_noise(context, self.n_samples)
+        noise = actor.density.draw_noise(context, self.n_samples)
         actions, log_prob = actor.density.rsample_and_log_prob(context, noise)
         correlation = actor.action_correlation(obs, self.n_samples).abs().mean(0)
         features = critic.extract_features(obs, critic.features_extractor)

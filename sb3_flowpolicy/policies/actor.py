@@ -108,10 +108,6 @@ class FlowActor(Actor):
         """Return the features h that the density is conditioned on, shape (batch, H)."""
         return self.latent_pi(self.extract_features(obs, self.features_extractor))
 
-    def draw_noise(self, context: th.Tensor, *sample_shape: int) -> th.Tensor:
-        """Draw standard normal noise that fits ``context``, shape (sample_shape, batch, M)."""
-        return self.density.draw_noise(context, *sample_shape)
-
     def forward(
         self, obs: PyTorchObs, deterministic: bool = False, noise: th.Tensor | None = None
     ) -> th.Tensor:
@@ -119,23 +115,21 @@ class FlowActor(Actor):
         context = self.context(obs)
         if deterministic:
             return self.density.mode(context)
-        noise = self.draw_noise(context) if noise is None else noise
+        noise = self.density.draw_noise(context) if noise is None else noise
         return self.density.rsample(context, noise)
 
     def act(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Return the same actions as :meth:`forward`, sooner; gradients must be disabled."""
         features = self.extract_features(obs, self.features_extractor)
-        modules = (self.latent_pi, self.density)
-        if deterministic:
-            return self.traced(_mode, modules, features)
-        return self.traced(_sample, modules, features, self.draw_noise(features))
+        noise = () if deterministic else (self.density.draw_noise(features),)
+        return self.traced(_act, (self.latent_pi, self.density), features, *noise)
 
     def action_log_prob(
         self, obs: PyTorchObs, noise: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
         """Sample reparametrized actions (batch, D) and score them (batch,) in one pass."""
         context = self.context(obs)
-        noise = self.draw_noise(context) if noise is None else noise
+        noise = self.density.draw_noise(context) if noise is None else noise
         return self.density.rsample_and_log_prob(context, noise)
 
     def log_prob(self, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
@@ -169,7 +163,7 @@ class FlowActor(Actor):
             Entropy in nats, shape (batch,); at most D log 2, the value of the uniform distribution.
         """
         context = self.context(obs)
-        noise = self.draw_noise(context, integer(1)("n_samples", n_samples))
+        noise = self.density.draw_noise(context, integer(1)("n_samples", n_samples))
         return -self.density.rsample_and_log_prob(context, noise)[1].mean(0)
 
     @th.no_grad()
@@ -180,7 +174,7 @@ class FlowActor(Actor):
             Correlation matrices, shape (batch, D, D), entries in [-1, 1].
         """
         context = self.context(obs)
-        noise = self.draw_noise(context, n_samples)
+        noise = self.density.draw_noise(context, n_samples)
         actions = self.density.rsample(context, noise).movedim(0, -1)
         centered = actions - actions.mean(-1, keepdim=True)
         # A constant dimension has correlation 0 with all others and 1 with itself.
@@ -190,14 +184,12 @@ class FlowActor(Actor):
         return correlation.diagonal_scatter(th.ones_like(correlation[..., 0]), dim1=-2, dim2=-1)
 
 
-def _mode(latent_pi: nn.Module, density: TanhSquashed, features: th.Tensor) -> th.Tensor:
-    return density.mode(latent_pi(features))
-
-
-def _sample(
-    latent_pi: nn.Module, density: TanhSquashed, features: th.Tensor, noise: th.Tensor
+def _act(
+    latent_pi: nn.Module, density: TanhSquashed, features: th.Tensor, *noise: th.Tensor
 ) -> th.Tensor:
-    return density.rsample(latent_pi(features), noise)
+    """Return a sample, or without noise the mode."""
+    context = latent_pi(features)
+    return density.rsample(context, *noise) if noise else density.mode(context)
 
 
 def _lift_heads(

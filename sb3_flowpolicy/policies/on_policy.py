@@ -125,11 +125,8 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = BasePolicy.extract_features(self, observation, self.pi_features_extractor)
-        modules = (self.mlp_extractor, self.action_net)
-        if deterministic:
-            return self.traced(_mode, modules, features)
-        noise = self.action_dist.density.draw_noise(features)
-        return self.traced(_sample, modules, features, noise)
+        noise = () if deterministic else (self.action_dist.density.draw_noise(features),)
+        return self.traced(_act, (self.mlp_extractor, self.action_net), features, *noise)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Return actions, which must be finite, values and log-probabilities, as SB3 does."""
@@ -205,14 +202,12 @@ class DensityActorCritic(DensityPolicy, ActorCriticPolicy):
         }
 
 
-def _mode(extractor: MlpExtractor, density: ActionDistribution, features: th.Tensor) -> th.Tensor:
-    return density.mode(extractor.forward_actor(features))
-
-
-def _sample(
-    extractor: MlpExtractor, density: ActionDistribution, features: th.Tensor, noise: th.Tensor
+def _act(
+    extractor: MlpExtractor, density: ActionDistribution, features: th.Tensor, *noise: th.Tensor
 ) -> th.Tensor:
-    return density.rsample(extractor.forward_actor(features), noise)
+    """Return a sample, or without noise the mode."""
+    context = extractor.forward_actor(features)
+    return density.rsample(context, *noise) if noise else density.mode(context)
 
 
 def bound_gradient(gradient: th.Tensor) -> th.Tensor:

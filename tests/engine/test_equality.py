@@ -222,7 +222,7 @@ def crossq_loop(model: CrossQ, batches: list[Batch]) -> None:
         noise += [batch.noise[1, 0]] + ([batch.noise[0, 0]] if k % model.policy_delay == 0 else [])
     remaining, drawn = iter(samples), iter(noise)
     model.replay_buffer.sample = lambda *_, **__: next(remaining)  # type: ignore[union-attr, method-assign]
-    model.actor.draw_noise = lambda context: next(drawn)  # type: ignore[assignment]
+    model.actor.density.draw_noise = lambda context: next(drawn)  # type: ignore[assignment]
     model.train(len(batches), BATCH_SIZE)
 
 

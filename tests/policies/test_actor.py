@@ -35,7 +35,7 @@ def actor(request: pytest.FixtureRequest) -> FlowActor:
 
 def test_noise_decides_the_action(actor: FlowActor) -> None:
     obs = th.randn(5, 3)
-    noise = actor.draw_noise(actor.context(obs))
+    noise = actor.density.draw_noise(actor.context(obs))
     action, log_prob = actor.action_log_prob(obs, noise)
     assert th.equal(actor(obs, noise=noise), action)
     assert action.shape == (5, 2)
