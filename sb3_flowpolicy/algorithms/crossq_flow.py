@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from sb3_contrib import CrossQ
 from sb3_contrib.crossq.policies import CrossQPolicy
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
-from sb3_flowpolicy.common.validation import check_settings, flag, integer, number
+from sb3_flowpolicy.common.validation import integer
 from sb3_flowpolicy.engine.crossq import CrossQObjective
 from sb3_flowpolicy.policies import crossq
-
-_NORMALIZATION = {
-    "batch_norm": flag,
-    "batch_norm_momentum": number(0, 1),
-    "batch_norm_eps": number(0, above=True),
-    "renorm_warmup_steps": integer(0),
-}
 
 
 class CrossQFlow(EngineFlow, CrossQ):
@@ -41,10 +34,6 @@ class CrossQFlow(EngineFlow, CrossQ):
     policy_class_of_stock = CrossQPolicy
     settings: ClassVar = {**EngineFlow.settings, "policy_delay": integer(1)}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = crossq.ALIASES
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        check_settings(kwargs.get("policy_kwargs") or {}, _NORMALIZATION)
-        super().__init__(*args, **kwargs)
 
     def objective(self) -> CrossQObjective:
         """Return CrossQ's objective, with the present ``policy_delay``."""

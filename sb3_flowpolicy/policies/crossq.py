@@ -14,12 +14,7 @@ from torch import nn
 from sb3_flowpolicy.policies.actor import FlowActor
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
-_BATCH_NORM = {
-    "batch_norm": True,
-    "batch_norm_momentum": 0.01,
-    "batch_norm_eps": 0.001,
-    "renorm_warmup_steps": 100_000,
-}
+_BATCH_NORM = ("batch_norm", "batch_norm_momentum", "batch_norm_eps", "renorm_warmup_steps")
 
 
 class CrossQFlowActor(FlowActor):
@@ -34,9 +29,7 @@ class CrossQFlowActor(FlowActor):
     set_bn_training_mode = StockCrossQActor.set_bn_training_mode
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._batch_norm: dict[str, Any] = {
-            name: kwargs.pop(name, default) for name, default in _BATCH_NORM.items()
-        }
+        self._batch_norm: dict[str, Any] = {name: kwargs.pop(name) for name in _BATCH_NORM}
         super().__init__(*args, **kwargs)
 
     def _make_latent_pi(self) -> nn.Sequential:

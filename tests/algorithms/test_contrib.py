@@ -116,10 +116,6 @@ def test_bad_arguments_of_one_algorithm() -> None:
         make(TQCFlow, top_quantiles_to_drop_per_net=1.5)
     with pytest.raises(ValueError, match="n_quantiles must be an integer of at least 1, got 0"):
         make(TQCFlow, policy_kwargs={"n_quantiles": 0})
-    with pytest.raises(ValueError, match="batch_norm_momentum must be at most 1, got 5"):
-        make(CrossQFlow, policy_kwargs={"batch_norm_momentum": 5})
-    with pytest.raises(ValueError, match="renorm_warmup_steps must be an integer of at least 0"):
-        make(CrossQFlow, policy_kwargs={"renorm_warmup_steps": -5})
     with pytest.raises(ValueError, match="policy_delay must be an integer of at least 1, got 0"):
         make(CrossQFlow, policy_delay=0)
 
