@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,8 +59,7 @@ def check_experience(
 from environment 1 at step 7, index (1,); nothing of this step was stored
     """
     for name, value in columns.items():
-        if not (isinstance(value, np.ndarray) and all_finite(value)):
-            _check(name, value, lambda at: _origin(who(at[0]), step, at))
+        _check(name, value, lambda at: _origin(who(at[0]), step, at))
 
 
 def check_step(
@@ -70,17 +70,12 @@ def check_step(
     step: int,
 ) -> None:
     """Reject the result of a step of an SB3 ``VecEnv``, as :func:`check_experience` does."""
-    # The ordinary step takes as few calls as possible: between two updates the cache is cold.
-    ordinary = type(observations) is np.ndarray and observations.dtype.kind == "f"
-    seen = observations.ravel() if ordinary else rewards
-    if not ordinary or not float(seen.dot(seen)) + float(rewards.dot(rewards)) < _SURELY_FINITE:
-        check_experience({"observations": observations, "rewards": rewards}, step)
-    if not any(dones):
-        return
-    for index, done in enumerate(dones):
-        if done and infos[index].get("terminal_observation") is not None:
-            who, last = f"environment {index}", infos[index]["terminal_observation"]
-            _check("final observations", last, lambda at, who=who: _origin(who, step, at))  # type: ignore[misc]
+    check_experience({"observations": observations, "rewards": rewards}, step)
+    for index in np.flatnonzero(dones).tolist():
+        last = infos[index].get("terminal_observation")
+        if last is not None:
+            where = partial(_origin, f"environment {index}", step)
+            _check("final observations", last, where)
 
 
 def _origin(who: str, step: int, at: tuple[int, ...]) -> str:
