@@ -17,6 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
+from torch.utils._pytree import tree_map_only
 
 from sb3_flowpolicy.algorithms import exploration
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
@@ -372,8 +373,11 @@ class EngineFlow(OffPolicyAlgorithm):
         self._exploration.restart(dones)
 
     def get_parameters(self) -> dict[str, dict]:
-        """Return the parameters as SB3 does, as copies that share no memory with others."""
-        return _copies(super().get_parameters())
+        """Return the parameters as SB3 does, as copies.
+
+        The engine's views would bring the whole memory that they look at into a saved file.
+        """
+        return tree_map_only(th.Tensor, lambda one: one.detach().clone(), super().get_parameters())
 
     def _describe_run(self) -> Run:
         return Run(
@@ -402,15 +406,6 @@ class EngineFlow(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_guard", "_checkpoints", "_runtime"]
-
-
-def _copies(value: Any) -> Any:
-    """Copy tensors: views would bring the whole memory that they look at into a file."""
-    if isinstance(value, th.Tensor):
-        return value.detach().clone()
-    if isinstance(value, dict):
-        return type(value)((key, _copies(part)) for key, part in value.items())
-    return [_copies(part) for part in value] if isinstance(value, list) else value
 
 
 def warn_of_stock_loop(reason: str) -> None:

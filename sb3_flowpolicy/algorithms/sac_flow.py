@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -28,7 +28,8 @@ from sb3_flowpolicy.engine.sac import SB3_CRITIC_LOSS_COEF, SACObjective
 from sb3_flowpolicy.policies import sac
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
-SelfSACFlow = TypeVar("SelfSACFlow", bound="SACFlow")
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class SACFlow(EngineFlow, SAC):
@@ -158,11 +159,11 @@ class SACFlow(EngineFlow, SAC):
 
     @classmethod
     def load_safe(
-        cls: type[SelfSACFlow],
+        cls,
         path: str | Path,
         env: GymEnv | str | None = None,
         device: th.device | str = "auto",
-    ) -> SelfSACFlow:
+    ) -> Self:
         """Read a file of :meth:`save_safe` without executing anything that it names.
 
         Args:
