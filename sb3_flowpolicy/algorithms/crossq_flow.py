@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 from sb3_contrib import CrossQ
-from sb3_contrib.crossq.policies import CrossQPolicy
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
@@ -31,7 +30,6 @@ class CrossQFlow(EngineFlow, CrossQ):
     """
 
     stock = CrossQ
-    policy_class_of_stock = CrossQPolicy
     settings: ClassVar = {**EngineFlow.settings, "policy_delay": integer(1)}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = crossq.ALIASES
 

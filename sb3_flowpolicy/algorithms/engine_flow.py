@@ -14,7 +14,6 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils._pytree import tree_map_only
@@ -74,8 +73,6 @@ class EngineFlow(OffPolicyAlgorithm):
     ent_coef_optimizer: th.optim.Adam | None
     stock: ClassVar[type[OffPolicyAlgorithm]]
     """The algorithm of SB3 or sb3-contrib that this one extends."""
-    policy_class_of_stock: ClassVar[type[BasePolicy]]
-    """Base class of its policies."""
     settings: ClassVar[Mapping[str, Check]] = {
         "buffer_size": integer(1),
         "learning_starts": number(0),
@@ -113,7 +110,8 @@ class EngineFlow(OffPolicyAlgorithm):
     ) -> None:
         given = by_name(self.stock, args, kwargs)
         check_settings({**given, "compile": compile, "autocast": autocast}, self.settings)
-        check_policy(given.get("policy"), self.policy_class_of_stock, self.policy_aliases)
+        stock_policy = self.stock.policy_aliases["MlpPolicy"]
+        check_policy(given.get("policy"), stock_policy, self.policy_aliases)
         self.compile: bool | Literal["auto"] = compile
         self.autocast = autocast
         self.action_noise_color = action_noise_color

@@ -82,7 +82,6 @@ class SACFlow(EngineFlow, SAC):
     """
 
     stock = SAC
-    policy_class_of_stock = SACPolicy
     settings: ClassVar = {
         **EngineFlow.settings,
         "random_steps": optional(integer(0)),

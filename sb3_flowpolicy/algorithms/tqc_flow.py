@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 from sb3_contrib import TQC
-from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
@@ -33,7 +32,6 @@ class TQCFlow(EngineFlow, TQC):
     """
 
     stock = TQC
-    policy_class_of_stock = TQCPolicy
     settings: ClassVar = {**EngineFlow.settings, "top_quantiles_to_drop_per_net": integer(0)}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = tqc.ALIASES
 

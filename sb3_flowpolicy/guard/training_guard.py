@@ -55,7 +55,7 @@ class TrainingGuard:
         """Discard the copies, when learning begins; messages name the folder of checkpoints."""
         self.resume_from = resume_from
         self._kept: list[dict[str, th.Tensor]] = []
-        self._kept_at, self._due = 0, -1
+        self._kept_at = 0
 
     def look(self) -> list[dict[str, th.Tensor]]:
         """Copy what training changes, agent by agent, and check that it is finite.
@@ -78,9 +78,8 @@ class TrainingGuard:
     def before_updates(self) -> None:
         """Check and copy everything, if that is due, as :meth:`look` does."""
         done = self.models[0]._n_updates
-        if done >= self._due:
-            self._kept = self.look()
-            self._kept_at, self._due = done, done + UPDATES_BETWEEN_LOOKS
+        if not self._kept or done >= self._kept_at + UPDATES_BETWEEN_LOOKS:
+            self._kept, self._kept_at = self.look(), done
 
     def after_updates(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -110,12 +111,12 @@ def check_finite(values: np.ndarray, name: str = "actions") -> None:
         )
 
 
-def with_forms(module: dict[str, Any], **policies: type[BasePolicy]) -> dict[str, Any]:
+def with_forms(**policies: type[BasePolicy]) -> dict[str, Any]:
     """Derive the ``Cnn...`` and ``MultiInput...`` form of each class; return all by alias.
 
     The first of ``policies`` is the default, for which ``"MlpPolicy"`` stands. The forms are added
-    to ``module``, the ``globals()`` of the module that defines the classes, because a saved model
-    refers to its policy class by module and name.
+    to the module that defines the class, because a saved model refers to its policy class by
+    module and name.
 
     Example:
         >>> from sb3_flowpolicy.policies.sac import ALIASES
@@ -134,7 +135,8 @@ def with_forms(module: dict[str, Any], **policies: type[BasePolicy]) -> dict[str
                 "__doc__": f":class:`{policy.__name__}` for {kind} observations.",
             }
             form = type(f"{prefix}{policy.__name__}", (policy,), attributes)
-            module[form.__name__] = aliases[f"{prefix}{alias}"] = form
+            setattr(sys.modules[form.__module__], form.__name__, form)
+            aliases[f"{prefix}{alias}"] = form
             if alias == default:
                 aliases[f"{prefix}Policy"] = form
     return aliases

@@ -245,7 +245,6 @@ class LowRankActorCriticPolicy(DensityActorCritic):
 
 
 ALIASES = with_forms(
-    globals(),
     FlowPolicy=FlowActorCriticPolicy,
     LowRankPolicy=LowRankActorCriticPolicy,
     GaussPolicy=GaussActorCriticPolicy,

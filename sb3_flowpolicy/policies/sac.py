@@ -37,9 +37,7 @@ class FlowPolicy(DistributionPolicy, SACPolicy):
     default_distribution = "realnvp"
 
 
-ALIASES = with_forms(
-    globals(), FlowPolicy=FlowPolicy, LowRankPolicy=LowRankPolicy, GaussPolicy=GaussPolicy
-)
+ALIASES = with_forms(FlowPolicy=FlowPolicy, LowRankPolicy=LowRankPolicy, GaussPolicy=GaussPolicy)
 _KINDS = ("Flow", "LowRank", "Gauss")
 CnnFlowPolicy, CnnLowRankPolicy, CnnGaussPolicy = (ALIASES[f"Cnn{kind}Policy"] for kind in _KINDS)
 MultiInputFlowPolicy, MultiInputLowRankPolicy, MultiInputGaussPolicy = (

@@ -32,5 +32,5 @@ class FlowTQCPolicy(DistributionPolicy, TQCPolicy):
 
 
 ALIASES = with_forms(
-    globals(), FlowPolicy=FlowTQCPolicy, LowRankPolicy=LowRankTQCPolicy, GaussPolicy=GaussTQCPolicy
+    FlowPolicy=FlowTQCPolicy, LowRankPolicy=LowRankTQCPolicy, GaussPolicy=GaussTQCPolicy
 )

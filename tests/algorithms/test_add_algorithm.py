@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.sac.policies import SACPolicy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import NonFiniteError, SACFlow
@@ -47,7 +46,6 @@ class CautiousSAC(SAC):
 
 class CautiousSACFlow(EngineFlow, CautiousSAC):
     stock = CautiousSAC
-    policy_class_of_stock = SACPolicy
     policy_aliases = SACFlow.policy_aliases
     settings: ClassVar = {**EngineFlow.settings, "caution": number(0, 1)}
 
