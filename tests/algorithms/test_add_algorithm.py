@@ -74,10 +74,3 @@ def test_it_is_guarded_and_its_arguments_are_checked() -> None:
         ValueError, match=r"must be one of .* or subclass SACPolicy, got 'NoPolicy'"
     ):
         CautiousSACFlow("NoPolicy", ENV, **FAST)
-
-
-def test_it_can_be_trained_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    zoo = pytest.importorskip("rl_zoo3.utils")
-    monkeypatch.setitem(zoo.ALGOS, "cautious_sac", CautiousSACFlow)
-    model = zoo.ALGOS["cautious_sac"]("FlowPolicy", ENV, **FAST).learn(30)
-    assert model._n_updates > 0

@@ -25,11 +25,6 @@ def test_unknown_name_lists_the_known_ones() -> None:
         make_distribution("nvp", 2, 3)
 
 
-def test_unknown_arguments_are_refused_by_python() -> None:
-    with pytest.raises(TypeError, match=r'"realnvp": .* unexpected keyword argument .layer'):
-        make_distribution("realnvp", 2, 3, layer=4)
-
-
 def test_kwargs_reach_the_density() -> None:
     flow = make_distribution("realnvp", 2, 3, layers=6, hidden=[8, 8])
     assert isinstance(flow, RealNVP)

@@ -114,23 +114,6 @@ def test_starts_as_a_standard_normal_for_every_context() -> None:
     th.testing.assert_close(log_prob, expected, rtol=0, atol=1e-4)
 
 
-def test_default_init_is_not_the_identity() -> None:
-    flow = Spline(3, CONTEXT_DIM, init="default")
-    noise = th.randn(50, 3)
-    moved = flow.rsample_and_log_prob(th.zeros(50, CONTEXT_DIM), noise)[0]
-    assert not th.allclose(moved, noise, atol=1e-2)
-
-
-@pytest.mark.parametrize("layers", [1, 2, 3])
-@pytest.mark.parametrize("dim", [1, 2, 5])
-def test_every_shape_inverts(dim: int, layers: int) -> None:
-    th.manual_seed(0)
-    flow = Spline(dim, CONTEXT_DIM, layers=layers, hidden=(6,), init="default", bins=5).double()
-    context = th.randn(9, CONTEXT_DIM, dtype=th.float64)
-    u, log_prob = flow.rsample_and_log_prob(context, 2 * th.randn(9, dim, dtype=th.float64))
-    th.testing.assert_close(flow.log_prob(context, u), log_prob)
-
-
 def test_one_dimension_can_have_two_modes() -> None:
     """Fitted to two peaks, the flow is far better than the best normal distribution."""
     th.manual_seed(0)
@@ -153,16 +136,7 @@ def test_far_away_points_score_as_a_normal_would() -> None:
     th.testing.assert_close(flow.log_prob(th.zeros(1, CONTEXT_DIM).double(), far), expected)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"bins": 1}, "bins must be an integer of at least 2, got 1"),
-        ({"bins": 4.0}, "bins must be an integer of at least 2, got 4.0"),
-        ({"layers": 0}, "layers must be an integer of at least 1, got 0"),
-        ({"hidden": ()}, "hidden must be a list of one or more layer sizes"),
-        ({"init": "zeros"}, "init must be one of .*'identity', 'default'.*, got 'zeros'"),
-    ],
-)
-def test_bad_arguments(kwargs: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Spline(2, 3, **kwargs)
+@pytest.mark.parametrize("bins", [1, 4.0])
+def test_bad_numbers_of_bins(bins: float) -> None:
+    with pytest.raises(ValueError, match=f"bins must be an integer of at least 2, got {bins}"):
+        Spline(2, 3, bins=bins)  # type: ignore[arg-type]

@@ -127,10 +127,6 @@ def test_sb3_distribution_interface(actor: FlowActor) -> None:
     [
         ({"distribution": "nvp"}, "distribution must be one of"),
         (
-            {"distribution": "low_rank", "distribution_kwargs": {"rank": 3}},
-            "rank must be an integer from 1 to 2, got 3",
-        ),
-        (
             {"distribution_kwargs": {2: "layers"}},
             "distribution_kwargs must be None or a dict with strings",
         ),

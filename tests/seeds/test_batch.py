@@ -212,9 +212,6 @@ def test_what_was_done_to_the_agents_in_between_is_kept(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="agents must all have the same settings"):
             batch.learn(1, reset_num_timesteps=False)
         setattr(batch.models[0], name, before)
-    batch.models[0].tau = 0.5
-    with pytest.raises(ValueError, match="agents must all have the same settings"):
-        batch.learn(10, reset_num_timesteps=False)
 
 
 def test_callbacks_that_write_files_get_their_seed(tmp_path: Path) -> None:
@@ -325,17 +322,6 @@ def test_info_keywords_must_be_there() -> None:
     batch = SeedBatch("GaussPolicy", ENV, 1, info_keywords=["x_std"], **FAST)
     with pytest.raises(KeyError, match="x_std"):
         batch.learn(60)
-
-
-def test_agents_may_train_on_their_own_in_between() -> None:
-    batch = SeedBatch("FlowPolicy", "Pendulum-v1", 2, **FAST).learn(40)
-    batch.models[0].train(1, 16)
-    batch.models[1].train(1, 16)
-    batch.learn(30, reset_num_timesteps=False)
-    for model in batch.models:
-        assert model.replay_buffer is not None
-        assert model.replay_buffer.size() == 70
-        assert np.abs(model.replay_buffer.observations[40:70, 0]).sum(-1).min() > 0
 
 
 def test_callbacks_may_reset_optimizers_and_move_weights() -> None:
