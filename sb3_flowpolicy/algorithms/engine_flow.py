@@ -133,8 +133,8 @@ class EngineFlow(OffPolicyAlgorithm):
     def resume(cls, path: str | Path, env: GymEnv | str, device: th.device | str = "auto") -> Self:
         """Resume a run from its newest undamaged checkpoint.
 
-        Repeat the interrupted call of :meth:`learn` with the same arguments: it goes on to the same
-        end, and all numbers are those of a run that was not interrupted. Checkpoints contain
+        Repeat the interrupted call of :meth:`learn` with the same arguments: it continues to the
+        same end, and all numbers are those of a run that was not interrupted. Checkpoints contain
         pickles: resume only those that you trust.
 
         Args:

@@ -28,9 +28,9 @@ SETTINGS: dict[str, Check] = {
 class NoiseProcess:
     r"""A stationary Gaussian process per environment, with a spectrum like :math:`f^{-\beta}`.
 
-    Every value on its own is exactly standard normal, from the first step of an episode on. So at
-    a fixed state a density that is handed this noise has the distribution it always has, while
-    successive actions correlate: the agent moves somewhere instead of jittering in place.
+    Each value is exactly standard normal, from the first step of an episode on. At a fixed state,
+    actions made from this noise therefore have their usual distribution, while successive actions
+    correlate: the agent moves somewhere instead of jittering in place.
 
     The process is a weighted sum of first-order autoregressions with correlation times from half a
     step to sixteen horizons. Unlike noise that is made in the frequency domain it needs no length
@@ -98,7 +98,7 @@ class NoiseProcess:
         """Return what is needed to continue the same process."""
         return {"values": self._values.clone(), "starting": self._starting.clone()}
 
-    def set_state(self, state: dict[str, th.Tensor]) -> None:
+    def load_state(self, state: dict[str, th.Tensor]) -> None:
         """Restore what :meth:`state` returned."""
         self._values, self._starting = state["values"].clone(), state["starting"].clone()
 
@@ -183,7 +183,7 @@ class ColoredExploration:
     def load_state(self, state: dict[str, th.Tensor] | None) -> None:
         """Restore what :meth:`state` returned."""
         if self.process is not None and state is not None:
-            self.process.set_state(state)
+            self.process.load_state(state)
 
 
 def _episode_length(env: Any) -> int | None:

@@ -11,7 +11,7 @@ from torch import nn
 from sb3_flowpolicy.common.validation import integer
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-# Of one coordinate, in nats.
+# Per coordinate, in nats.
 STANDARD_NORMAL_ENTROPY = 0.5 + LOG_SQRT_2PI
 # Log-densities and gradients fit into float32 up to this many standard deviations from the mean.
 FARTHEST = 1e12
@@ -86,7 +86,7 @@ class ActionDistribution(nn.Module, ABC):
         return self._entropy(context)
 
     def shrink_heads(self) -> None:
-        """Reinitialize such that the density hardly depends on the context: on-policy algorithms.
+        """Reinitialize for on-policy algorithms: the density then hardly depends on the context.
 
         Weights of the layers that read the context become orthogonal with a small gain, biases
         zero, as in the last layer of SB3's on-policy policies. Override it where another start

@@ -146,8 +146,6 @@ class CouplingFlow(ActionDistribution):
     the transformation of the only coordinate depends on h alone.
 
     Args:
-        action_dim: Number of action dimensions D.
-        context_dim: Number of context features H.
         layers: Number of couplings L, at least 1.
         hidden: Units of the hidden layers of each coupling's network.
         init: ``"identity"`` starts as a standard normal for every h. ``"default"`` leaves

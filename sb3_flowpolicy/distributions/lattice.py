@@ -54,8 +54,6 @@ class Lattice(DiagGaussian):
     - Gradients of the standard deviations reach the features with on-policy algorithms, too.
 
     Args:
-        action_dim: Number of action dimensions D.
-        context_dim: Number of context features H.
         alpha: Scale of the noise of the features, at least 0; 0 gives a diagonal covariance.
 
     References:

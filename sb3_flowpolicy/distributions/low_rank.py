@@ -34,8 +34,6 @@ class LowRankGaussian(DiagGaussian):
     K and down to :math:`\sigma = e^{-20}`.
 
     Args:
-        action_dim: Number of action dimensions D, at least 1.
-        context_dim: Number of context features H, at least 1.
         rank: Rank K of the factor V, between 1 and D. Default: 2, or 1 where D = 1.
 
     References:

@@ -42,7 +42,7 @@ class Engine(BoundEngine):
         self.log_ent_coef: FlatParameters | None = None
         self.ent_coef_adam: FlatAdam | None = None
         if first.ent_coef_optimizer is not None:
-            # Not a module's parameter, but owned by an optimizer all the same.
+            # An optimizer owns it, although it belongs to no module.
             self.log_ent_coef = FlatParameters(
                 [{"log_ent_coef": [model.log_ent_coef]} for model in self.models]
             )

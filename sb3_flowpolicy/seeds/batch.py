@@ -299,7 +299,7 @@ class SeedBatch:
             environments={"batch": self._experience.venv, **own},
             ring=self._ring,
             extra=self._extra_state,
-            set_extra=self._set_extra_state,
+            set_extra=self._load_extra_state,
         )
 
     def _ring(self) -> Ring:
@@ -314,10 +314,10 @@ class SeedBatch:
             "engine": self._runtime.state(),
         }
 
-    def _set_extra_state(self, state: dict[str, Any]) -> None:
+    def _load_extra_state(self, state: dict[str, Any]) -> None:
         self._losses = state["losses"]
         self._runtime.load_state(state["engine"])
-        self._experience.set_state(state)
+        self._experience.load_state(state)
         if self._resumes_episodes():
             self._experience.obs = state["obs"]
         else:

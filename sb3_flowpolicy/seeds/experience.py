@@ -53,7 +53,7 @@ class SeedExperience:
         self._exploration = ColoredExploration()
         self._noise: dict[str, SeedNoise] = {}
         self.fit()
-        # Of the running episodes.
+        # Returns and lengths of the running episodes.
         self.returns, self.lengths = np.zeros(len(seeds)), np.zeros(len(seeds), dtype=int)
         self._start = time.time()
         self._writers: list[ResultsWriter] = []
@@ -84,7 +84,7 @@ class SeedExperience:
         noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
         self._exploration.fit(first, len(self.seeds), self.venv)
         process = self._exploration.process
-        # Name -> shape, and whether it is uniform. Those that still fit go on.
+        # Name -> shape, and whether it is uniform. Generators that still fit continue.
         wanted = {
             "random actions": (shape, True),
             "actions": ((1, noise_dim) if process is None else process.white_shape[1:], False),
@@ -217,10 +217,10 @@ class SeedExperience:
             },
         }
 
-    def set_state(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state` returned, except the observation."""
         for name, one in self._noise.items():
-            one.set_state(state["noise"][name])
+            one.load_state(state["noise"][name])
         self._exploration.load_state(state["exploration"])
         episodes = state["episodes"]
         self.returns, self.lengths = episodes["returns"], episodes["lengths"]
@@ -266,7 +266,7 @@ class SeedNoise:
         states = [generator.get_state() for generator in self.generators]
         return {"generators": states, "pool": self._pool}
 
-    def set_state(self, state: dict[str, Any]) -> None:
+    def load_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state` returned."""
         for generator, saved in zip(self.generators, state["generators"], strict=True):
             generator.set_state(saved)

@@ -25,7 +25,7 @@ FAST: dict[str, Any] = {
     "seed": 0,
     "learning_starts": 10_000,
 }
-# Of densities without a policy class of their own, the names.
+# Densities without a policy class stand under their names.
 POLICIES = pytest.mark.parametrize(
     "policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", "lattice", "spline"]
 )
@@ -213,7 +213,7 @@ def test_settings_of_a_batch_can_change() -> None:
         batch._experience._noise["actions"].shape
         == batch._experience._exploration.process.white_shape[1:]
     )
-    assert batch._experience._noise["updates"] is updates  # whose numbers go on
+    assert batch._experience._noise["updates"] is updates  # it continues with its numbers
     for model in batch.models:
         model.action_noise_color = 0.0
     batch.learn(4, reset_num_timesteps=False)

@@ -18,7 +18,7 @@ def weights_are_finite(model: Any) -> bool:
 
 @pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
 @pytest.mark.parametrize("what", ["rewards", "final"])
-def test_other_algorithms_do_not_believe_them_either(algorithm: Any, what: str) -> None:
+def test_other_algorithms_check_experience(algorithm: Any, what: str) -> None:
     model = algorithm("FlowPolicy", Faulty(what, np.nan), **SEEDED)
     with pytest.raises(NonFiniteError, match="must be finite in float32, got nan from environment"):
         model.learn(40)
@@ -28,7 +28,7 @@ def test_other_algorithms_do_not_believe_them_either(algorithm: Any, what: str) 
 
 
 @pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
-def test_other_algorithms_go_back_as_well(algorithm: Any) -> None:
+def test_other_algorithms_restore_finite_weights(algorithm: Any) -> None:
     model = algorithm("FlowPolicy", Faulty("nothing", 0.0), **SEEDED)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     model.learn(30)

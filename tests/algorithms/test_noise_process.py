@@ -56,7 +56,7 @@ def test_ornstein_uhlenbeck_forgets_at_the_rate_that_was_asked_for() -> None:
     assert np.corrcoef(values[0], values[5])[0, 1] == pytest.approx(np.exp(-1), abs=0.02)
 
 
-def test_white_noise_is_handed_through() -> None:
+def test_white_noise_is_unchanged() -> None:
     white = th.randn(3, 1, 2)
     process = NoiseProcess(2, 3)
     for _ in range(2):
@@ -72,12 +72,12 @@ def test_an_episode_begins_without_a_past() -> None:
     assert np.corrcoef(before[10_000:], after[10_000:])[0, 1] > 0.95
 
 
-def test_a_state_goes_on_as_if_nothing_had_happened() -> None:
+def test_a_restored_process_continues_with_the_same_numbers() -> None:
     process = NoiseProcess(2, 3, color=1.0)
     run(process, 5)
     process.restart(np.array([True, False, False]))
     state = process.state()
     expected = run(process, 5, seed=1)
     other = NoiseProcess(2, 3, color=1.0)
-    other.set_state(state)
+    other.load_state(state)
     np.testing.assert_array_equal(run(other, 5, seed=1), expected)

@@ -9,7 +9,6 @@ import torch as th
 from torch.func import functional_call, stack_module_state, vmap
 
 from sb3_flowpolicy.distributions import ActionDistribution, TanhSquashed, registered_distributions
-from sb3_flowpolicy.distributions.loc_scale import LocScale
 from tests.distributions.conftest import CONTEXT_DIM, build
 
 
@@ -76,20 +75,6 @@ def test_squashed_log_prob_is_the_change_of_variables(
         expected = base_log_prob - log_jacobian.sum()
         assert th.equal(action, u.tanh())
         assert log_prob.item() == pytest.approx(expected.item(), abs=1e-6)
-
-
-def test_sampling_and_scoring_agree(density: ActionDistribution) -> None:
-    context = th.randn(7, CONTEXT_DIM, dtype=th.float64, generator=th.Generator().manual_seed(3))
-    noise = draw(density, 7)
-    u, log_prob = density.rsample_and_log_prob(context, noise)
-    th.testing.assert_close(density.log_prob(context, u), log_prob, rtol=1e-8, atol=1e-6)
-
-
-def test_samples_to_act_with_are_those_that_are_scored(density: ActionDistribution) -> None:
-    context, noise = th.randn(4, 1, CONTEXT_DIM, dtype=th.float64), draw(density, 4, 3)
-    for one in (density, TanhSquashed(density), LocScale(density).double()):
-        scored, _ = one.rsample_and_log_prob(context, noise)
-        assert th.equal(one.rsample(context, noise), scored)
 
 
 def test_mode_is_the_image_of_zero_noise(density: ActionDistribution, context: th.Tensor) -> None:

@@ -31,7 +31,7 @@ FAST: dict[str, Any] = {"learning_starts": 200, "buffer_size": 300, "seed": 0, "
 
 
 class DoubleExtractor(CombinedExtractor):
-    """SB3 casts observations to float32; here they go on in float64."""
+    """SB3 casts observations to float32; here they stay in float64."""
 
     def forward(self, obs: dict[str, th.Tensor]) -> th.Tensor:
         return super().forward(obs).double()

@@ -28,7 +28,7 @@ OURS: dict[Any, Any] = {SAC: SACFlow, TQC: TQCFlow, CrossQ: CrossQFlow}
 
 
 class DoubleExtractor(FlattenExtractor):
-    """SB3 casts observations to float32; here they go on in float64."""
+    """SB3 casts observations to float32; here they stay in float64."""
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         return super().forward(obs).double()

@@ -1,4 +1,4 @@
-"""Where torch cannot compile, training goes on eagerly: one warning, the same numbers."""
+"""Where torch cannot compile, training runs eagerly, with one warning and the same numbers."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ ENV = "SquareMove-v1"
 
 
 class _SameType(FlattenExtractor):
-    """SB3 casts observations to float32; here they go on in the type of the parameters."""
+    """SB3 casts observations to float32; here they get the type of the parameters."""
 
     dtype = th.float32
 

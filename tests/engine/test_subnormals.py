@@ -44,7 +44,7 @@ def test_restored_after_an_error() -> None:
     assert not is_flushed()
 
 
-def test_whoever_asked_for_it_keeps_it() -> None:
+def test_a_program_that_asked_for_flushing_keeps_it() -> None:
     th.set_flush_denormal(True)
     with flushed_subnormals():
         assert is_flushed()

@@ -1,4 +1,4 @@
-"""The engine holds models by the hand, not in a cage: what is done to them is noticed."""
+"""The engine notices what others do to the models that it trains."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_assigned_parameters_without_an_optimizer_are_left_to_sb3() -> None:
 
 
 def test_an_engine_that_no_longer_fits_is_dropped() -> None:
-    """Its tensors are orphans: the policy must not go on acting with them."""
+    """The policy must not act with the tensors of an engine that no longer trains it."""
     model = make(SACFlow, "FlowPolicy", th.float32, compile=False)
     assert isinstance(model, SACFlow)
     model.train(1, batch_size=BATCH_SIZE)

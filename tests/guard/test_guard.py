@@ -1,4 +1,4 @@
-"""NaN is refused at the gate; where it arises in training, the run stops and says where."""
+"""Experience with NaN is rejected; a run stops where training produces NaN, and says where."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def size(model: SACFlow) -> int:
         ("final", r"final observations .* got {} from environment 0 at step 20, index \(1,\);"),
     ],
 )
-def test_environments_are_not_believed(what: str, message: str, value: float) -> None:
+def test_experience_is_checked(what: str, message: str, value: float) -> None:
     model = SACFlow("FlowPolicy", Faulty(what, value), compile=False, **SEEDED)
     with pytest.raises(NonFiniteError, match=message.format(value)):
         model.learn(50)
@@ -87,7 +87,7 @@ def test_environments_are_not_believed(what: str, message: str, value: float) ->
 def test_the_first_observation_counts() -> None:
     with pytest.raises(NonFiniteError, match=r"observations must be finite .* at step 0"):
         SACFlow("FlowPolicy", Faulty("reset", np.nan), **SEEDED).learn(5)
-    # Of two environments per agent the second is the one that is stepped.
+    # Each agent has two environments, of which the batch steps the second.
     values = iter([0.0, np.nan])
     batch = SeedBatch("FlowPolicy", lambda: Faulty("reset", next(values)), [4], **FAST)
     with pytest.raises(

@@ -323,13 +323,6 @@ def test_bad_arguments(kwargs: dict[str, Any], message: str) -> None:
         PPO(FlowActorCriticPolicy, Box2D(), policy_kwargs=kwargs)
 
 
-def test_unknown_arguments_are_refused_by_python() -> None:
-    with pytest.raises(TypeError, match="unexpected keyword argument 'layers'"):
-        PPO(FlowActorCriticPolicy, Box2D(), policy_kwargs={"layers": 2})
-    with pytest.raises(TypeError, match="unexpected keyword argument 'layer'"):
-        PPO(FlowActorCriticPolicy, Box2D(), policy_kwargs={"distribution_kwargs": {"layer": 2}})
-
-
 def test_bad_spaces_and_gsde() -> None:
     with pytest.raises(ValueError, match=r"action_space must be a Box, got Discrete\(2\)"):
         PPO(FlowActorCriticPolicy, "CartPole-v1")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import PPO
 from torch import nn
 
 from sb3_flowpolicy.distributions import ActionDistribution, registered_distributions, registry
@@ -68,14 +68,6 @@ def test_it_starts_as_the_stock_policy(
         samples, _ = mine.density.rsample_and_log_prob(mine.context, noise)
     expected = th.full((64, 4), float(np.exp(log_std_init)))
     th.testing.assert_close(samples.std(0), expected, rtol=0.08, atol=0)
-
-
-@EVERY_DENSITY
-def test_a2c_starts_in_the_same_way(distribution: str) -> None:
-    stock, ours = build_pair(distribution, A2C)
-    obs = th.randn(8, 3)
-    expected = stock.get_distribution(obs).mode()
-    th.testing.assert_close(ours.get_distribution(obs).mode(), expected, rtol=0, atol=1e-6)
 
 
 @EVERY_DENSITY
