@@ -105,11 +105,9 @@ class SACFlow(EngineFlow, SAC):
         check_settings(own, self.settings)
         self.random_steps = random_steps
         self.critic_loss_coef = critic_loss_coef
-        self._demonstrations: Any = (
-            demonstrations
-            if demonstrations is None or is_recipe(demonstrations)
-            else load_demonstrations(demonstrations)
-        )
+        if demonstrations is not None and not is_recipe(demonstrations):
+            demonstrations = load_demonstrations(demonstrations)
+        self._demonstrations: Any = demonstrations
         super().__init__(policy, env, *sac_args, **sac_kwargs)
 
     def add_demonstrations(self, demonstrations: str | Path | Mapping[str, np.ndarray]) -> int:
@@ -183,11 +181,11 @@ class SACFlow(EngineFlow, SAC):
             raise ValueError("learn() needs a replay buffer: give env to load_safe to train on")
         # Here and not at construction: a model that is loaded to act needs no demonstrations.
         if self._demonstrations is not None:
-            if is_recipe(self._demonstrations):
+            rows = self._demonstrations
+            if is_recipe(rows):
                 assert self.env is not None
-                recorded = follow_recipe(self.env, self.seed, **self._demonstrations)
-                self._demonstrations = recorded
-            self.add_demonstrations(self._demonstrations)
+                rows = follow_recipe(self.env, self.seed, **rows)
+            self.add_demonstrations(rows)
             self._demonstrations = None
         return super()._setup_learn(*args, **kwargs)
 

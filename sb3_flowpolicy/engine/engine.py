@@ -204,12 +204,11 @@ class Engine(BoundEngine):
         history = self.history = []
         flags = [self.objective.is_due(first, k, start) for k in range(len(batches))]
         for batch, flag in zip(batches, flags, strict=True):
-            parts = [batch] if len(groups) == 1 else [batch.of(seeds) for seeds, _ in groups]
-            losses = [
-                self._update_once(state, part, learning_rates, flag)
-                for (_, state), part in zip(groups, parts, strict=True)
-            ]
-            history.append(losses[0] if len(losses) == 1 else th.cat(losses, dim=1))
+            losses = []
+            for seeds, state in groups:
+                part = batch if len(groups) == 1 else batch.of(seeds)
+                losses.append(self._update_once(state, part, learning_rates, flag))
+            history.append(th.cat(losses, dim=1))
         means, self.logged = self.objective.mean_losses(history, sum(flags))
         return means
 

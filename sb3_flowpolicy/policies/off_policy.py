@@ -42,7 +42,6 @@ class DistributionPolicy(DensityPolicy):
     # Attributes of the algorithm's own policy class.
     actor: Any
     critic: Any
-    actor_kwargs: dict[str, Any]
     net_args: dict[str, Any]
 
     def __init__(
@@ -74,7 +73,7 @@ class DistributionPolicy(DensityPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """Build the actor."""
-        if self.actor_kwargs["use_sde"]:
+        if self._uses_sde:
             return super().make_actor(features_extractor)  # type: ignore[misc]
         net_args = self._update_features_extractor(self.net_args, features_extractor)
         actor = self.actor_class(

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_flowpolicy import CrossQFlow, NonFiniteError, SACFlow, SeedBatch
 from sb3_flowpolicy.guard.finite import all_finite
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
+from tests.engine.test_equality import everything
 
 FAST: dict[str, Any] = {
     "learning_starts": 10,
@@ -162,21 +163,6 @@ def trained(policy: str = "FlowPolicy", **settings: Any) -> SACFlow:
     return model.learn(60)
 
 
-def state(model: SACFlow) -> dict[str, np.ndarray]:
-    found = {k: v.numpy().copy() for k, v in model.policy.state_dict().items()}
-    for name, optimizer in (("actor", model.actor.optimizer), ("critic", model.critic.optimizer)):
-        for number, entry in enumerate(optimizer.state.values()):
-            found |= {f"{name}.{number}.{k}": v.numpy().copy() for k, v in entry.items()}
-    assert model.log_ent_coef is not None
-    return {**found, "log_ent_coef": model.log_ent_coef.detach().numpy().copy()}
-
-
-def assert_equal(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert got.keys() == expected.keys()
-    for name, value in expected.items():
-        np.testing.assert_array_equal(got[name], value, err_msg=name)
-
-
 def spoil(model: SACFlow, column: str, row: int, value: float) -> None:
     assert model.replay_buffer is not None
     getattr(model.replay_buffer, column)[row] = value
@@ -198,7 +184,7 @@ def test_training_stops_and_goes_back(
 ) -> None:
     kwargs = {"net_arch": [16, 16], "optimizer_class": optimizer}
     model = trained(policy_kwargs=kwargs)
-    before, updates = state(model), model._n_updates
+    before, updates = everything(model), model._n_updates
     model._guard.restart()  # as learn() does
     spoil(model, column, slice(None), value)  # type: ignore[arg-type]
     if optimizer is th.optim.SGD:  # SB3 tells means over all updates, of which each may be first
@@ -208,7 +194,7 @@ def test_training_stops_and_goes_back(
     error = str(caught.value)
     assert model._n_updates == updates
     assert f"back at update {updates}" in error
-    assert_equal(state(model), before)
+    th.testing.assert_close(everything(model), before, rtol=0, atol=0)
     look_at = "values not finite, the first in row" if not np.isfinite(value) else "extreme in row"
     assert re.search(f"{column} [^;]*{look_at}", error)
     # The model is of use again once the data are.
@@ -295,13 +281,13 @@ def test_parameters_are_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) 
 
 def test_seed_batch_names_the_agent_and_takes_all_back() -> None:
     batch = SeedBatch("FlowPolicy", "Pendulum-v1", [3, 9, 7], compile=False, **FAST).learn(40)
-    before = [state(model) for model in batch.models]
+    before = [everything(model) for model in batch.models]
     spoil(batch.models[1], "rewards", slice(0, 40), np.nan)  # type: ignore[arg-type]
     message = r"critic_loss .* \(seed 9, step 4\d\) in update 3[12]; .* back at update 30\."
     with pytest.raises(NonFiniteError, match=message):
         batch.learn(30, reset_num_timesteps=False)
     for model, expected in zip(batch.models, before, strict=True):
-        assert_equal(state(model), expected)
+        th.testing.assert_close(everything(model), expected, rtol=0, atol=0)
         assert model._n_updates == 30
     spoil(batch.models[1], "rewards", slice(None), 0.0)  # type: ignore[arg-type]
     batch.learn(5, reset_num_timesteps=False)
