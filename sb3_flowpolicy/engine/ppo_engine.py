@@ -16,9 +16,7 @@ from sb3_flowpolicy.engine.compiling import Compiled
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.ppo_update import (
     PPO_LOSSES,
-    PPOBatch,
     PPOSettings,
-    PPOState,
     make_ppo_update,
     policy_function,
 )
@@ -119,13 +117,12 @@ class PPOEngine(BoundEngine):
         rate = self.policy.optimizer.param_groups[0]["lr"]
         scalars = th.tensor([rate, clip_range, clip_range_vf], dtype=th.float64)
         scalars = scalars.to(self.flat.data.device)
-        state = PPOState(self.flat.data, self.adam.moments)
         found: list[th.Tensor] = []
         start_of_epoch, stopped = 0, False
         for epoch in range(model.n_epochs):
             start_of_epoch = len(found)
             for samples in model.rollout_buffer.get(model.batch_size):
-                found.append(self._update_once(state, samples, scalars))
+                found.append(self._update_once(samples, scalars))
                 if target_kl is not None and found[-1][3] > 1.5 * target_kl:
                     stopped = True
                     break
@@ -141,14 +138,11 @@ class PPOEngine(BoundEngine):
         losses["approx_kl"] = losses["approx_kl"][start_of_epoch:]
         return losses
 
-    def _update_once(
-        self, state: PPOState, samples: RolloutBufferSamples, scalars: th.Tensor
-    ) -> th.Tensor:
-        noise = None
-        if self.settings.ent_coef:
-            noise = self.policy.draw_entropy_noise(len(samples.actions))
-        batch = PPOBatch(*samples[:6], noise)
+    def _update_once(self, samples: RolloutBufferSamples, scalars: th.Tensor) -> th.Tensor:
+        size = len(samples.actions)
+        noise = self.policy.draw_entropy_noise(size) if self.settings.ent_coef else None
+        arguments = (self.flat.data, self.adam.moments, samples, noise, scalars)
         # The rest of a rollout that does not fill a minibatch is not worth a graph of its own.
-        if len(samples.actions) < self.model.batch_size:
-            return self._eager_update(state, batch, scalars)
-        return self._update(len(samples.actions), state, batch, scalars)
+        if size < self.model.batch_size:
+            return self._eager_update(*arguments)
+        return self._update(size, *arguments)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch as th
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from torch.func import functional_call
 from torch.nn.functional import mse_loss
 
@@ -14,26 +14,6 @@ from sb3_flowpolicy.engine.adam import AdamSettings, Moments, adam_step
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic, bound_gradient
 from sb3_flowpolicy.policies.traced import AsForward
-
-
-class PPOState(NamedTuple):
-    """Everything an update changes, in place."""
-
-    parameters: th.Tensor  # (1, P)
-    moments: Moments
-
-
-class PPOBatch(NamedTuple):
-    """A minibatch of a rollout."""
-
-    obs: th.Tensor  # (B, ...)
-    actions: th.Tensor  # (B, D)
-    old_values: th.Tensor  # (B,)
-    old_log_prob: th.Tensor  # (B,)
-    advantages: th.Tensor  # (B,)
-    returns: th.Tensor  # (B,)
-    noise: th.Tensor | None  # (K, B, M), None if the entropy is not estimated
-
 
 PPO_LOSSES = (
     "entropy_loss",
@@ -60,8 +40,11 @@ class PPOSettings:
     target_kl: float | None
 
 
-# (state, minibatch, [learning rate, clip range, clip range of values]) -> losses, (7,)
-PPOUpdate = Callable[[PPOState, PPOBatch, th.Tensor], th.Tensor]
+# (parameters (1, P), moments, minibatch, noise (K, B, M) or None if the entropy is not estimated,
+# [learning rate, clip range, clip range of values]) -> losses, (7,)
+PPOUpdate = Callable[
+    [th.Tensor, Moments, RolloutBufferSamples, th.Tensor | None, th.Tensor], th.Tensor
+]
 
 
 def policy_function(
@@ -90,10 +73,16 @@ def make_ppo_update(
     """
     score = policy_function(policy, flat, "score")
 
-    def update(state: PPOState, batch: PPOBatch, scalars: th.Tensor) -> th.Tensor:
+    def update(
+        parameters: th.Tensor,
+        moments: Moments,
+        batch: RolloutBufferSamples,
+        noise: th.Tensor | None,
+        scalars: th.Tensor,
+    ) -> th.Tensor:
         learning_rate, clip_range, clip_range_vf = scalars
-        parameters = state.parameters.detach().requires_grad_()
-        found = score(parameters, batch.obs, batch.actions, batch.noise)
+        weights = parameters.detach().requires_grad_()
+        found = score(weights, batch.observations, batch.actions, noise)
         outputs = [output.flatten() for output in found if output is not None]
         # The loss depends on the networks through these few numbers per row alone. Its gradient
         # with respect to them is bounded before it goes on to the parameters.
@@ -119,16 +108,16 @@ def make_ppo_update(
 
         gradients = list(th.autograd.grad(loss, leaves))
         gradients[1] = bound_gradient(gradients[1])
-        (gradient,) = th.autograd.grad(outputs, parameters, gradients)
+        (gradient,) = th.autograd.grad(outputs, weights, gradients)
         norm = gradient.norm()
         gradient = gradient * (settings.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-        stepped = adam_step(state.parameters, gradient, state.moments, learning_rate, settings.adam)
+        stepped = adam_step(parameters, gradient, moments, learning_rate, settings.adam)
 
         finite = log_prob.isfinite().all()
         applies = finite
         if settings.target_kl is not None:
             applies = applies & (approx_kl <= 1.5 * settings.target_kl)
-        for old, new in zip((state.parameters, *state.moments), stepped, strict=True):
+        for old, new in zip((parameters, *moments), stepped, strict=True):
             old.copy_(th.where(applies, new, old))
         losses = entropy_loss, policy_loss, value_loss, approx_kl, clip_fraction, loss
         return th.stack([*(part.detach() for part in losses), finite.to(loss.dtype)])
