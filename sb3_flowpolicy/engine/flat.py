@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch as th
@@ -34,13 +35,10 @@ class FlatParameters:
     def __init__(self, layouts: Sequence[Layout], copies: bool = False) -> None:
         #: The parameters of each seed.
         self.owners = [[part for parts in one.values() for part in parts] for one in layouts]
-        first = layouts[0]
-        self.names = list(first)
-        self.shapes = [
-            (len(parts), *parts[0].shape) if copies else tuple(parts[0].shape)
-            for parts in first.values()
-        ]
-        self.sizes = [sum(part.numel() for part in parts) for parts in first.values()]
+        self.shapes = {
+            name: (len(parts), *parts[0].shape) if copies else tuple(parts[0].shape)
+            for name, parts in layouts[0].items()
+        }
         self.bind()
 
     def views(self, flat: th.Tensor, seed: int) -> list[tuple[nn.Parameter, th.Tensor]]:
@@ -73,8 +71,8 @@ class FlatParameters:
 
     def unflatten(self, flat: th.Tensor) -> dict[str, th.Tensor]:
         """Split (S, P) into named tensors of shape (S, *shape), without copying."""
-        parts = flat.split(self.sizes, dim=-1)
+        parts = flat.split([math.prod(shape) for shape in self.shapes.values()], dim=-1)
         return {
             name: part.unflatten(-1, shape) if len(shape) != 1 else part
-            for name, part, shape in zip(self.names, parts, self.shapes, strict=True)
+            for (name, shape), part in zip(self.shapes.items(), parts, strict=True)
         }
