@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,54 +22,23 @@ from tests.experiments.conftest import MakeUp, declare_whole
 NAME = "circle-narrow"
 
 
-def _without_seed(lines: list[str]) -> list[str]:
-    return [line for line in lines if not line.startswith("2,")]
-
-
-def _without_end(lines: list[str]) -> list[str]:
-    return lines[:-1]
-
-
-def _out_of_order(lines: list[str]) -> list[str]:
-    return [lines[0], lines[2], lines[1], *lines[3:]]
-
-
-def _other_seed(lines: list[str]) -> list[str]:
-    return [*lines[:-1], lines[-1].replace("2,", "7,", 1)]
-
-
-def _half_a_seed(lines: list[str]) -> list[str]:
-    return [*lines[:-1], lines[-1].replace("2,", "1.5,", 1)]
-
-
-def _nothing(lines: list[str]) -> list[str]:
-    return []
-
-
-def _head_only(lines: list[str]) -> list[str]:
-    return lines[:1]
-
-
-@pytest.mark.parametrize(
-    "change",
-    [_without_seed, _without_end, _out_of_order, _other_seed, _half_a_seed, _nothing, _head_only],
-)
-def test_rows_that_are_missing_or_odd_are_noticed(
-    change: Callable[[list[str]], list[str]], make_up: MakeUp, tmp_path: Path
+def test_changed_results_stop_the_run_and_the_report(
+    make_up: MakeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make_up(NAME, seeds=2)
-    files = ItemFiles(tmp_path / NAME, "narrow-flow")
-    files.table.write_text("".join(change(files.table.read_text().splitlines(keepends=True))))
-    with pytest.raises(ValueError, match=r"narrow-flow\.csv .*must hold"):
-        Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
-
-
-def test_a_number_that_was_changed_is_noticed(make_up: MakeUp, tmp_path: Path) -> None:
-    make_up(NAME, seeds=2)
+    run = ["run", NAME, "--seeds", "2", "--out", str(tmp_path), "--no-progress"]
+    assert main(run) == 0
     table = tmp_path / NAME / "narrow-flow.csv"
-    table.write_text(table.read_text().replace("500,50,", "500,51,", 1))
-    with pytest.raises(ValueError, match="or other contents"):
-        Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
+    text = table.read_text()
+    for changed in (text.replace("500,50,", "500,51,", 1), text[: text.index("\n") + 1], ""):
+        table.write_text(changed)
+        for command in (run, ["report", "--results", str(tmp_path)]):
+            assert main(command) == 1
+            error = capsys.readouterr().err
+            assert "narrow-flow.csv and " in error
+            assert f"bytes written to them, got {len(changed)} and " in error
+    table.unlink()
+    assert main(run) == 1
 
 
 @pytest.mark.parametrize(
@@ -89,19 +57,6 @@ def test_facts_of_something_else_are_noticed(
     done.write_text(json.dumps({**json.loads(done.read_text()), **facts}))
     with pytest.raises(ValueError, match=rf"narrow-flow\.done\.json {message}"):
         Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
-
-
-def test_a_run_does_not_build_on_damage(
-    make_up: MakeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    make_up(NAME, seeds=2)
-    command = ["run", NAME, "--seeds", "2", "--out", str(tmp_path), "--no-progress"]
-    assert main(command) == 0
-    (tmp_path / NAME / "narrow-flow.csv").unlink()
-    assert main(command) == 1
-    error = capsys.readouterr().err
-    assert "narrow-flow.csv and " in error
-    assert "bytes written to them, got 0 and " in error
 
 
 @pytest.mark.parametrize(
@@ -196,12 +151,7 @@ def test_three_times_the_bar_reaches_the_bar(make_up: MakeUp, tmp_path: Path) ->
     """0.8 + 0.8 + 0.8 is less than 2.4 in floating point."""
     make_up(NAME, seeds=2)
     files = ItemFiles(tmp_path / NAME, "narrow-flow")
-    lines = files.table.read_text().splitlines()
-    for k, line in enumerate(lines[1:], start=1):
-        cells = line.split(",")
-        cells[6] = "0.8"
-        lines[k] = ",".join(cells)
-    files.table.write_text("\n".join(lines) + "\n")
+    files.read_table().assign(test_success=0.8).to_csv(files.table, index=False)
     declare_whole(files)
     evidence = Evidence(EXPERIMENTS[NAME], tmp_path / NAME)
     assert evidence.solved("narrow", "flow").all()
