@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import shutil
 import sys
@@ -78,8 +77,7 @@ def _run(args: argparse.Namespace) -> None:
             f"Results: {folder}"
         )
         if items:
-            bar = Progress(plan.items, sorted(finished), shown=not args.no_progress)
-            with contextlib.closing(bar) as progress:
+            with Progress(plan.items, finished, shown=not args.no_progress) as progress:
                 if args.backend == "ray":
                     from sb3_flowpolicy.experiments.ray_backend import run_on_ray
 

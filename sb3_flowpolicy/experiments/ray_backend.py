@@ -25,7 +25,7 @@ _POLL_SECONDS = 0.5
 def run_on_ray(
     folder: Path, items: Sequence[WorkItem], progress: Progress, address: str | None = None
 ) -> None:
-    """Do items as Ray tasks; only this machine needs access to the folder, which has to be claimed.
+    """Do items as Ray tasks; only this machine needs access to the folder, which has to be locked.
 
     The cluster is that of ``address``, else the one that this process is connected to, that of the
     variable ``RAY_ADDRESS``, or a new one on this machine alone.
@@ -65,7 +65,7 @@ def run_on_ray(
                 for name, data in ray.get(reference).items():
                     with replacing(folder / name) as draft:
                         draft.write_bytes(data)
-                progress.update(item.key, item.steps)
+                progress.note(item.key, item.steps)
     except RayTaskError as error:
         for kind in (OSError, ValueError):
             if isinstance(error.cause, kind):

@@ -7,7 +7,6 @@ import functools
 import io
 import json
 import shutil
-from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -113,7 +112,7 @@ class Section:
         return {name: figure for name, figure in found.items() if figure is not None}
 
 
-def reservation(experiment: Experiment, settings: Mapping[str, Any]) -> str | None:
+def reservation(experiment: Experiment, settings: dict[str, Any]) -> str | None:
     """Explain why results with these settings are not the experiment's own, None if they are."""
     planned = work.make_plan(experiment)
     seeds = settings["seeds"]
@@ -125,10 +124,8 @@ def reservation(experiment: Experiment, settings: Mapping[str, Any]) -> str | No
     same = work.make_plan(
         experiment, steps=settings["steps"], seeds=len(seeds), seeds_per_item=together
     )
-    wanted = json.loads(json.dumps(same.settings()))
-    if settings != wanted:
-        return f"made with other settings ({differences(dict(settings), wanted)[0]})"
-    return None
+    found = differences(settings, json.loads(json.dumps(same.settings())))
+    return f"made with other settings ({found[0]})" if found else None
 
 
 def read_results(results: Path) -> list[Evidence]:

@@ -1,12 +1,13 @@
-"""Run a plan: claim its folder, take over what was done before, and train the rest in processes."""
+"""Run a plan: lock its folder, find what was done before, and train the rest in processes."""
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import queue
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -17,7 +18,8 @@ from unittest import mock
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
+from sb3_flowpolicy.common.files import read_json, write_json
+from sb3_flowpolicy.experiments.store import ItemFiles, differences
 from sb3_flowpolicy.experiments.work import Plan, WorkItem
 
 # OpenMP and numba read these when a process starts: one thread each, one process per core.
@@ -27,7 +29,9 @@ _reports: Any = None
 
 @contextmanager
 def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
-    """Claim the experiment's own folder in ``out`` for as long as a run lasts.
+    """Lock the experiment's own folder in ``out`` for as long as a run lasts.
+
+    The first run writes its settings there, and the folder keeps to them.
 
     Raises:
         ValueError: If it holds results of other settings, or another run is at work.
@@ -35,9 +39,17 @@ def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
     """
     folder = out / plan.experiment.name
     folder.mkdir(parents=True, exist_ok=True)
+    path, settings = folder / "settings.json", plan.settings()
     try:
         with FileLock(folder / ".run.lock", timeout=0):
-            claim_folder(folder, plan.settings())
+            if not path.exists():
+                write_json(path, settings)
+            if found := differences(read_json(path), json.loads(json.dumps(settings))):
+                raise ValueError(
+                    f"{folder} must hold results of the same settings, got others "
+                    f"({'; '.join(found[:5])}). Choose another folder with --out, or use the "
+                    "settings of the first run"
+                )
             yield folder
     except Timeout as error:
         raise ValueError(f"{folder} must be used by one run at a time, but another is") from error
@@ -52,18 +64,18 @@ def unfinished(folder: Path, plan: Plan) -> list[WorkItem]:
     ]
 
 
-class Progress:
+class Progress(tqdm):
     """A bar over the environment steps of all seeds that names the items at work.
 
     ``finished`` holds the keys of the items that were finished before this run.
     """
 
     def __init__(
-        self, items: Sequence[WorkItem], finished: Sequence[str] = (), shown: bool = True
+        self, items: Sequence[WorkItem], finished: Collection[str] = (), shown: bool = True
     ) -> None:
         self.items = {item.key: item for item in items}
         self.steps = {key: self.items[key].steps for key in finished}
-        self.bar = tqdm(
+        super().__init__(
             total=sum(item.all_steps for item in items),
             initial=sum(item.all_steps for item in items if item.key in finished),
             desc="all",
@@ -73,34 +85,30 @@ class Progress:
             dynamic_ncols=True,
         )
 
-    def update(self, key: str, steps: int) -> None:
+    def note(self, key: str, steps: int) -> None:
         """Note that each seed of an item has done so many steps."""
         item, known = self.items[key], key in self.steps
         steps = min(steps, item.steps)
         gained = (steps - self.steps.get(key, 0)) * len(item.seeds)
         self.steps[key] = steps
-        if not known and not self.bar.disable:
-            self.bar.initial += gained  # an earlier session's steps are no measure of this speed
+        if not known and not self.disable:
+            self.initial += gained  # an earlier session's steps are no measure of this speed
         shares = {name: done / self.items[name].steps for name, done in self.steps.items()}
         at_work = (f"{name} {share:.0%}" for name, share in shares.items() if share < 1)
-        self.bar.set_postfix_str(", ".join(at_work), False)
-        self.bar.update(gained)
+        self.set_postfix_str(", ".join(at_work), False)
+        self.update(gained)
 
     def take(self, reports: Any) -> None:
         """Note all reports in a queue: pairs of an item's key and its steps."""
         while True:
             try:
-                self.update(*reports.get_nowait())
+                self.note(*reports.get_nowait())
             except queue.Empty:
                 return
 
-    def close(self) -> None:
-        """Close the bar."""
-        self.bar.close()
-
 
 def run_local(folder: Path, items: Sequence[WorkItem], progress: Progress, workers: int) -> None:
-    """Do items in at most ``workers`` processes of this machine; ``folder`` has to be claimed.
+    """Do items in at most ``workers`` processes of this machine; ``folder`` has to be locked.
 
     Raises:
         ValueError: If an item's files are damaged.

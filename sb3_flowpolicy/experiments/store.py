@@ -8,7 +8,7 @@ A folder holds, per experiment, ``settings.json`` and three files per item:
 ``KEY.done.json``        written last; commit, versions, machine and time
 =======================  ======================================================================
 
-``checkpoints/KEY`` while the item is unfinished, and then its first agent, ``agents/KEY.zip``.
+An unfinished item also has ``checkpoints/KEY``, a finished one its first agent, ``agents/KEY.zip``.
 """
 
 from __future__ import annotations
@@ -65,25 +65,6 @@ def read_settings(folder: Path) -> dict[str, Any] | None:
             f"{settings['experiment']!r}, got {folder.name!r}"
         )
     return settings
-
-
-def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Make a folder belong to these settings, or check that it does.
-
-    Raises:
-        ValueError: If it holds results of other settings; the message names the differences.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "settings.json"
-    if not path.exists():
-        return write_json(path, settings)
-    found, wanted = read_json(path), json.loads(json.dumps(settings))
-    if found != wanted:
-        named = "; ".join(differences(found, wanted)[:5])
-        raise ValueError(
-            f"{folder} must hold results of the same settings, got others ({named}). "
-            "Choose another folder with --out, or use the settings of the first run"
-        )
 
 
 def differences(found: Any, wanted: Any, where: str = "") -> list[str]:

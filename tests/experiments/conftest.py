@@ -7,13 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sb3_flowpolicy.experiments.checks import mostly_fails, none_fails
 from sb3_flowpolicy.experiments.experiment import FLOW, GAUSS, Experiment, Setting
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
-from sb3_flowpolicy.experiments.store import ItemFiles, claim_folder
-from sb3_flowpolicy.experiments.work import Plan, make_plan
+from sb3_flowpolicy.experiments.runner import results_folder
+from sb3_flowpolicy.experiments.store import ItemFiles
+from sb3_flowpolicy.experiments.work import Plan, WorkItem, make_plan
 
 FAST = {
     "learning_starts": 30,
@@ -57,38 +59,35 @@ def make_up(tmp_path: Path) -> MakeUp:
     def write(name: str, levels: dict[str, float] | None = None, seeds: int = 10) -> Plan:
         chosen = levels or {"gauss": 0.0}
         plan = make_plan(EXPERIMENTS[name], seeds=seeds)
-        folder = tmp_path / name
-        claim_folder(folder, plan.settings())
-        for item in plan.items:
-            level = chosen.get(item.key, chosen.get(item.agent, 1.0))
-            _write_item(ItemFiles(folder, item.key), item, level)
+        with results_folder(tmp_path, plan) as folder:
+            for item in plan.items:
+                level = chosen.get(item.key, chosen.get(item.agent, 1.0))
+                _write_item(ItemFiles(folder, item.key), item, level)
         return plan
 
     return write
 
 
-def _write_item(files: ItemFiles, item, level: float) -> None:
-    steps = range(item.eval_every, item.steps + 1, item.eval_every)
+def _write_item(files: ItemFiles, item: WorkItem, level: float) -> None:
+    steps = np.arange(item.eval_every, item.steps + 1, item.eval_every)
+    done = level * np.minimum(1.0, 2.0 * steps / item.steps)
     learned = item.hyperparameters.get("ent_coef") == "auto"
     for seed in item.seeds:
-        rng = np.random.default_rng(seed)
-        rows = []
-        for step in steps:
-            done = level * min(1.0, 2.0 * step / item.steps)
-            rows.append(
-                {
-                    "seed": seed,
-                    "step": step,
-                    "episodes": 50,
-                    "train_return": done + 0.01 * rng.normal(),
-                    "train_success": done,
-                    "test_return": done + 0.01 * rng.normal(),
-                    "test_success": float(done >= 1.0),
-                    "entropy": -3.0 + level + 0.05 * rng.normal(),
-                    "ent_coef": 1 / step if learned else 0.01,
-                }
-            )
-        files.append_rows(rows)
+        noise = np.random.default_rng(seed).normal(size=(3, len(steps)))
+        table = pd.DataFrame(
+            {
+                "seed": seed,
+                "step": steps,
+                "episodes": 50,
+                "train_return": done + 0.01 * noise[0],
+                "train_success": done,
+                "test_return": done + 0.01 * noise[1],
+                "test_success": (done >= 1.0).astype(float),
+                "entropy": -3.0 + level + 0.05 * noise[2],
+                "ent_coef": 1 / steps if learned else 0.01,
+            }
+        )
+        files.append_rows(table.to_dict("records"))
         way = [k / 12 for k in range(12)]
         entropy = [level * (k - 6) for k in range(12)]
         if "profile" in item.measures:
@@ -100,23 +99,13 @@ def _write_item(files: ItemFiles, item, level: float) -> None:
         head = {"kind": "picture", "seed": item.seeds[0], "step": item.steps}
         files.append_detail({**head, **picture, "trail": trail})
     versions = {"torch": "2", "stable_baselines3": "2", "gymnasium": "1"}
-    machine = {
-        "commit": "abc",
-        "cpu_count": 2,
-        "processor": "p",
-        "python": "3",
-        "versions": versions,
-    }
-    files.finish(
-        {
-            **{"steps": item.steps, "seeds": list(item.seeds), "seconds": 60.0},
-            **{"cpu_seconds": 50.0, "steps_per_second": 100.0, "machine": machine},
-            **files.fingerprint(),
-        }
-    )
+    machine = {"commit": "abc", "cpu_count": 2, "processor": "p", "python": "3"}
+    facts = {"steps": item.steps, "seeds": item.seeds, "cpu_seconds": 50.0}
+    facts |= {"steps_per_second": 100.0, "machine": {**machine, "versions": versions}}
+    files.finish({**facts, **files.fingerprint()})
 
 
 def declare_whole(files: ItemFiles) -> None:
-    """Say of files that a test has changed that they are as the run left them."""
+    """Note the present contents of files that a test has changed as those of the run."""
     done = json.loads(files.done.read_text())
     files.done.write_text(json.dumps({**done, **files.fingerprint()}))

@@ -45,9 +45,10 @@ def test_a_run_leaves_results_and_is_not_repeated(
     assert [path.stat().st_mtime_ns for path in sorted(folder.glob("*.csv"))] == stamps
 
     # The same folder takes no results of other settings, and is left as it was.
-    assert main([*command, "--steps", "90"]) == 1
+    assert main([*command, "--steps", "90", "--first-seed", "2"]) == 1
     error = capsys.readouterr().err
     assert "must hold results of the same settings" in error
+    assert "items.circle-flow.seeds: there [1, 2], now [2, 3]" in error
     assert "steps: there 120, now 90" in error
     assert {path.name: path.read_bytes() for path in folder.glob("*.csv")} == tables
 

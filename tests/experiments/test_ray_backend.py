@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -35,9 +34,9 @@ def test_no_seed_is_lost_with_a_node(tiny: Experiment, tmp_path: Path) -> None:
         killed: list[str] = []
 
         class Watch(Progress):
-            def update(self, key: str, steps: int) -> None:
+            def note(self, key: str, steps: int) -> None:
                 seen.append(key)
-                super().update(key, steps)
+                super().note(key, steps)
 
         def kill_in_the_middle() -> None:
             # Two items have begun, one on either node.
@@ -49,7 +48,7 @@ def test_no_seed_is_lost_with_a_node(tiny: Experiment, tmp_path: Path) -> None:
         killer = threading.Thread(target=kill_in_the_middle, daemon=True)
         with (
             results_folder(tmp_path / "ray", plan) as folder,
-            closing(Watch(plan.items, shown=False)) as progress,
+            Watch(plan.items, shown=False) as progress,
         ):
             killer.start()
             run_on_ray(folder, unfinished(folder, plan), progress)
@@ -62,7 +61,7 @@ def test_no_seed_is_lost_with_a_node(tiny: Experiment, tmp_path: Path) -> None:
         cluster.shutdown()
     with (
         results_folder(tmp_path / "local", plan) as local,
-        closing(Progress(plan.items, shown=False)) as progress,
+        Progress(plan.items, shown=False) as progress,
     ):
         run_local(local, plan.items, progress, workers=2)
     for item in plan.items:

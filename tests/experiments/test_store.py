@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_flowpolicy.common.files import write_json
-from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, claim_folder
+from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles
 
 ROW = dict.fromkeys(BASIC_COLUMNS, 0.25) | {"seed": 1, "step": 100, "train_success": None}
 
@@ -55,26 +54,3 @@ def test_nothing_infinite_is_written(files: ItemFiles) -> None:
     with pytest.raises(ValueError, match="must be finite, got nan"):
         files.append_rows([{**ROW, "entropy": float("nan")}])
     assert files.table.read_bytes() == before
-
-
-def test_a_folder_keeps_to_its_settings(tmp_path: Path) -> None:
-    folder = tmp_path / "results"
-    claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 2)}}})
-    claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 2)}}})
-    with pytest.raises(ValueError, match=r"items\.a\.seeds: there \[1, 2\], now \[1, 3\]"):
-        claim_folder(folder, {"steps": 100, "items": {"a": {"seeds": (1, 3)}}})
-
-
-def test_damaged_settings_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "settings.json").write_text("{")
-    with pytest.raises(ValueError, match=r"settings\.json must be JSON, got Expecting"):
-        claim_folder(tmp_path, {"steps": 100})
-
-
-def test_a_file_is_written_at_once_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "done.json"
-    write_json(path, {"a": 1})
-    with pytest.raises(TypeError, match="not JSON serializable"):
-        write_json(path, {"a": object()})
-    assert '"a": 1' in path.read_text()
-    assert [one.name for one in tmp_path.iterdir()] == ["done.json"]
