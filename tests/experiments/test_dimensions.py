@@ -9,13 +9,13 @@ import pytest
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.dimensions.__main__ import main
 from sb3_flowpolicy.experiments.dimensions.prediction import (
+    FAMILIES,
     REACH,
     SURVIVAL_OF_RANDOM_STEPS,
     WIDTHS,
     _entropy,
+    best,
     bound,
-    correlated,
-    independent,
     survival_of,
 )
 
@@ -61,14 +61,14 @@ def test_entropy_is_that_of_squashed_noise():
 def test_independent_noise_in_two_dimensions_is_as_computed_by_hand():
     # The difference of two coordinates is normal, and 90 % of it within 1.645 deviations.
     scale = WIDTHS[2] / (2 * REACH) / 1.645
-    found = independent(2, WIDTHS[2], 0.9)
+    found = best("independent", 2, WIDTHS[2], 0.9)
     assert found.entropy == pytest.approx(2 * np.log(scale * np.sqrt(2 * np.pi * np.e)), abs=0.05)
 
 
 def test_correlation_is_worth_less_in_more_dimensions():
     gaps = []
     for dims in (2, 4, 8):
-        alone, joint = (one(dims, WIDTHS[dims], 0.9) for one in (independent, correlated))
+        alone, joint = (best(name, dims, WIDTHS[dims], 0.9) for name in FAMILIES)
         assert alone.entropy < joint.entropy < bound(dims, 0.9)
         assert alone.progress < joint.progress
         gaps.append(joint.entropy - alone.entropy)

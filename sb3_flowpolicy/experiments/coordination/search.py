@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,7 +42,7 @@ class Setting:
     """
 
     config: SquareConfig
-    steps: int = 80
+    steps: int
     ent_coef: float = 0.05
     gamma: float = 0.9
     episodes: int = 48
@@ -52,14 +52,14 @@ class Setting:
 
 def setting_of(
     env_id: str,
-    task: dict[str, float] | None = None,
-    arguments: dict[str, Any] | None = None,
+    task: dict[str, float],
+    arguments: dict[str, Any],
     **options: Any,
 ) -> Setting:
     """Return the setting of a Square's id, with other rewards and arguments of the environment.
 
     Raises:
-        ValueError: If the id is none of a Square, or a value is out of range.
+        ValueError: If the id is not that of a Square, or a value is out of range.
         TypeError: If a coefficient or an argument is unknown.
 
     Example:
@@ -69,15 +69,15 @@ def setting_of(
     spec = gym.spec(env_id)
     if spec.entry_point != "flowpolicy_envs.square.env:SquareEnv":
         raise ValueError(f"the id must be that of a Square, got {env_id}")
-    kwargs = {**spec.kwargs, **(arguments or {})}
+    kwargs = {**spec.kwargs, **arguments}
     rules = as_task(kwargs.pop("task", "hold"))
-    config = SquareConfig(type(rules)(**{**vars(rules), **(task or {})}), **kwargs)
+    config = SquareConfig(type(rules)(**{**vars(rules), **task}), **kwargs)
     return Setting(config, spec.max_episode_steps or 80, **options)
 
 
 def predict(
     setting: Setting,
-    names: tuple[str, ...] = tuple(FAMILIES),
+    names: Sequence[str],
     report: Callable[[int], None] | None = None,
 ) -> dict[str, dict[str, float]]:
     """Search the best policy of each family, named as in `FAMILIES`, and :func:`measure` it.

@@ -12,14 +12,7 @@ import pandas as pd
 
 from sb3_flowpolicy.common.command_line import HelpFormatter, check_folder_of
 from sb3_flowpolicy.common.files import write_json
-from sb3_flowpolicy.experiments.dimensions.prediction import (
-    WIDTHS,
-    bound,
-    correlated,
-    independent,
-)
-
-_FAMILIES = {"independent": independent, "correlated": correlated}
+from sb3_flowpolicy.experiments.dimensions.prediction import FAMILIES, WIDTHS, best, bound
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -45,13 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "width": width,
             "uniform": dims * math.log(2.0),
             "bound": bound(dims, args.survival),
-            **{k: asdict(best(dims, width, args.survival)) for k, best in _FAMILIES.items()},
+            **{name: asdict(best(name, dims, width, args.survival)) for name in FAMILIES},
         }
         for dims, width in WIDTHS.items()
     ]
     table = pd.json_normalize(rows).set_index("dims")
     told = ["width", "uniform", "bound"]
-    told += [f"{family}.{what}" for what in ("entropy", "progress") for family in _FAMILIES]
+    told += [f"{family}.{what}" for what in ("entropy", "progress") for family in FAMILIES]
     print(table[told].to_string(float_format="{:.4f}".format))
     if args.json is not None:
         write_json(args.json, {"survival": args.survival, "rows": rows})

@@ -15,7 +15,6 @@ with the mean :math:`\bar a` of its coordinates, the width :math:`w` and the rea
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,8 +40,16 @@ REACH: float = TUNNEL_IDS["TunnelDiagonal-v0"]["reach"]
 SURVIVAL_OF_RANDOM_STEPS = 1.0 - (1.0 - WIDTHS[2] / (2.0 * math.sqrt(2.0) * REACH)) ** 2
 """Share of uniformly random first steps that survive with two dimensions, 8.6 %."""
 
+FAMILIES = {
+    "independent": (0.0,),
+    "correlated": (0.0, *np.geomspace(0.02, 2.0, 24), *np.geomspace(2.2, 6.0, 6)),
+}
+"""Standard deviations of common noise to try, by family. A policy squashes a normal by tanh. The
+coordinates can be exchanged, so the best covariance treats them alike: it is a multiple of the
+identity plus common noise. A low-rank policy of any rank contains it, and so does one with a full
+covariance: their predictions coincide."""
+
 _SAMPLES = 20_000
-_COMMON_SCALES = (*np.geomspace(0.02, 2.0, 24), *np.geomspace(2.2, 6.0, 6))
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(200)
 
 
@@ -86,39 +93,23 @@ def bound(dims: int, survival: float) -> float:
     """
     q = SURVIVAL_OF_RANDOM_STEPS
     inside = survival * math.log(q / survival)
-    outside = (1.0 - survival) * math.log((1.0 - q) / (1.0 - survival)) if survival < 1.0 else 0.0
+    outside = (1.0 - survival) * math.log((1.0 - q) / (1.0 - survival))
     return dims * math.log(2.0) + inside + outside
 
 
-def independent(dims: int, width: float, survival: float, seed: int = 0) -> Prediction:
-    """Return the best policy whose coordinates are independent squashed normals.
+def best(family: str, dims: int, width: float, survival: float) -> Prediction:
+    """Return the policy of a family with the highest entropy.
 
     Args:
+        family: Key of ``FAMILIES``.
         dims: Number of coupled dimensions D, at least 2.
         width: Width of the tunnel, world units.
         survival: Probability with which a step survives, in (0, 1).
-        seed: Seed of the estimate.
     """
-    return _best(dims, width, survival, (0.0,), seed)
-
-
-def correlated(dims: int, width: float, survival: float, seed: int = 0) -> Prediction:
-    """Return the best policy whose coordinates are squashed normals with common noise.
-
-    The coordinates can be exchanged, so the best covariance that treats them alike is a multiple of
-    the identity plus common noise. A low-rank policy of any rank contains it, and so does one with
-    a full covariance: their predictions coincide. Arguments as in :func:`independent`.
-    """
-    return _best(dims, width, survival, (0.0, *_COMMON_SCALES), seed)
-
-
-def _best(
-    dims: int, width: float, survival: float, commons: Sequence[float], seed: int
-) -> Prediction:
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     shared, own = rng.standard_normal((_SAMPLES, 1)), rng.standard_normal((_SAMPLES, dims))
     candidates = []
-    for common in commons:
+    for common in FAMILIES[family]:
         scale = _widest(common * shared, own, width, survival)
         progress = float(np.tanh(common * shared + scale * own).mean(axis=1).std())
         candidates.append(Prediction(_entropy(dims, scale, common), progress, scale, float(common)))
@@ -128,7 +119,7 @@ def _best(
 def _widest(
     shared: NDArray[np.float64], own: NDArray[np.float64], width: float, survival: float
 ) -> float:
-    """Return the largest scale of `own` (N, D) that survives, by bisection of its logarithm.
+    """Return the largest scale of ``own`` (N, D) that survives, by bisection of its logarithm.
 
     The search ends where the entropy of a squashed coordinate falls again.
     """

@@ -42,7 +42,7 @@ def test_entropy_is_that_of_squashed_noise():
 
 
 def test_the_objective_of_a_safe_policy_is_its_reward_over_one_minus_gamma():
-    setting = setting_of("SquareMoveX-v0", {"effort": 0.0, "y": 0.0}, ent_coef=0.0)
+    setting = setting_of("SquareMoveX-v0", {"effort": 0.0, "y": 0.0}, {}, ent_coef=0.0)
     batch = SquareBatch(setting.config, 8)
     noise = np.zeros((setting.steps, 8, 8))
     found = measure(setting, 0.8 * INWARDS.sum(axis=0), 1e-3 * np.eye(8), noise, batch, 0)
@@ -52,7 +52,7 @@ def test_the_objective_of_a_safe_policy_is_its_reward_over_one_minus_gamma():
 
 
 def test_coordination_pays_where_opposed_fingers_lose_their_grip():
-    setting = setting_of("SquareMoveX-v1", budget=150, episodes=16)
+    setting = setting_of("SquareMoveX-v1", {}, {}, budget=150, episodes=16)
     found = predict(setting, ("independent", "full"))
     independent, full = found["independent"], found["full"]
     assert full["entropy"] > independent["entropy"] + 0.5
