@@ -18,7 +18,6 @@ from sb3_flowpolicy.experiments.tables import WORDS, in_digits
 
 # The share of seeds that have to learn something for an agent to be called steady.
 _MOST = 0.9
-_ROUNDING = 1e-9
 
 
 def ordered(setting: str, metric: str, agents: Sequence[Agent], margin: float = 0.0) -> Check:
@@ -113,8 +112,8 @@ def no_better_than(other: str, setting: str, agents: Sequence[Agent]) -> Check:
 def slower(setting: str, slow: Agent, others: Sequence[Agent]) -> Check:
     """Check that an agent is likely to need more steps than others until it solves the task.
 
-    Likely: the 95 % interval of the probability lies above one half. Means whose intervals overlap
-    show nothing.
+    That is, the 95 % interval of the probability lies above one half. Means whose intervals overlap
+    would not show it.
     """
 
     def test(evidence: Evidence) -> Finding:
@@ -144,14 +143,9 @@ def slower(setting: str, slow: Agent, others: Sequence[Agent]) -> Check:
 def front_loads(setting: str, agent: Agent, than: Agent, margin: float) -> Check:
     """Check that an agent has more entropy at the start than on average along the way.
 
-    The agent meets an entropy target where that costs least: a step that fails at the start loses
-    little. Every episode passes through the start, so these states are frequent, too.
-
-    Args:
-        setting: The setting.
-        agent: The agent that is claimed to spend its entropy at the start.
-        than: The agent that is claimed to do so less.
-        margin: Least difference between the two, nats.
+    An agent meets an entropy target where that costs least: a step that fails at the start loses
+    little. Every episode passes through the start, so these states are frequent, too. The agent
+    ``than`` is claimed to do so less, by at least ``margin`` nats.
     """
 
     def test(evidence: Evidence) -> Finding:
@@ -173,7 +167,7 @@ def solved(setting: str, agent: Agent, share: float, at_best: bool = False) -> C
     when = "at its best" if at_best else "at the end"
     return Check(
         f"{setting}: {agent.label} solves the task {when} in at least {share:.0%} of the seeds",
-        _counted(setting, agent, lambda found: found.mean() >= share - _ROUNDING, at_best),
+        _counted(setting, agent, lambda found: found.mean() >= share, at_best),
     )
 
 
@@ -181,7 +175,7 @@ def mostly_fails(setting: str, agent: Agent, share: float) -> Check:
     """Check that at most this share of the seeds solves the task at the end."""
     return Check(
         f"{setting}: {agent.label} solves the task at the end in at most {share:.0%} of the seeds",
-        _counted(setting, agent, lambda found: found.mean() <= share + _ROUNDING),
+        _counted(setting, agent, lambda found: found.mean() <= share),
     )
 
 
@@ -195,7 +189,7 @@ def oscillates(setting: str, agent: Agent, share: float) -> Check:
 
     def test(evidence: Evidence) -> Finding:
         flags, measured = _swinging(evidence, setting, agent)
-        return Finding(bool(flags.mean() >= share - _ROUNDING), measured)
+        return Finding(bool(flags.mean() >= share), measured)
 
     return Check(
         f"{setting}: {agent.label} oscillates (at least {SWINGS_OF_AN_OSCILLATION} swings in "
@@ -214,7 +208,7 @@ def is_steady(setting: str, agent: Agent, share: float) -> Check:
         flags, measured = _swinging(evidence, setting, agent)
         learned = evidence.succeeded(setting, agent.name)
         return Finding(
-            bool(flags.mean() <= share + _ROUNDING and learned.mean() >= _MOST),
+            bool(flags.mean() <= share and learned.mean() >= _MOST),
             f"{measured}; {learned.sum()} of {len(learned)} ever succeed in training",
         )
 

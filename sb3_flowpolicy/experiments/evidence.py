@@ -24,7 +24,7 @@ from sb3_flowpolicy.experiments.experiment import (
 )
 from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles, read_settings
 
-# The share of evaluations, at the end of training, that "final" refers to, and the least number.
+# "Final" values are means over this share of the evaluations, and at least so many, at the end.
 FINAL_SHARE, FINAL_LEAST = 0.1, 3
 # Success rate of deterministic episodes from which on a seed has solved its task.
 SOLVED = 0.8
@@ -42,8 +42,8 @@ SWINGS_OF_AN_OSCILLATION = 3
 class Evidence:
     """Results of one experiment.
 
-    Curves are data frames with a row per step and a column per seed; what is said of each seed is
-    an array (S,).
+    Curves are data frames with a row per step and a column per seed; other results are arrays with
+    a value per seed, (S,).
 
     Args:
         experiment: The experiment.
@@ -98,12 +98,11 @@ class Evidence:
 
     @cached_property
     def _logs(self) -> dict[tuple[str, str], pd.DataFrame]:
-        tables = {key: ItemFiles(self.folder, key).read_table() for key in self.items}
         logs: dict[tuple[str, str], pd.DataFrame] = {}
         for key, item in self.items.items():
-            if not tables[key].empty:
-                pair = item["setting"], item["agent"]
-                logs[pair] = pd.concat([logs.get(pair), tables[key]])
+            table, pair = ItemFiles(self.folder, key).read_table(), (item["setting"], item["agent"])
+            if not table.empty:
+                logs[pair] = pd.concat([logs.get(pair), table])
         return logs
 
     @property
@@ -197,7 +196,7 @@ class Evidence:
     def front_loading(self, setting: str, agent: str) -> np.ndarray:
         """Return each seed's entropy at the start less the mean along the way, (S,).
 
-        Every episode visits the start, and then hardly any state before the end of its first step.
+        Every episode visits the start, but hardly any state within a step of it.
         """
         profile = self.profile(setting, agent)
         if profile is None:

@@ -6,12 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-REPRODUCED, PARTLY, NOT_REPRODUCED, NOT_MEASURED = (
-    "reproduced",
-    "partly reproduced",
-    "not reproduced",
-    "not measured",
-)
+REPRODUCED = "reproduced"
+PARTLY = "partly reproduced"
+NOT_REPRODUCED = "not reproduced"
+NOT_MEASURED = "not measured"
 
 
 @dataclass(frozen=True)
@@ -22,8 +20,8 @@ class Agent:
         name: Name in commands and file names.
         label: Name in figures.
         algo: File of ``zoo_hyperparams`` that holds its hyperparameters.
-        color: Its color in all figures. Those of the thesis's agents remain distinct in print and
-            for color-blind readers (Okabe and Ito); there are not ten such colors.
+        color: Its color in all figures. The colors of the thesis's agents remain distinct in print
+            and for color-blind readers (Okabe and Ito).
         overrides: What differs from that file, merged into nested mappings.
     """
 

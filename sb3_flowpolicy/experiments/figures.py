@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.patches import Rectangle
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.common.statistics import interquartile_mean
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Fields above this share are so dark that their text has to be white.
-_DARK = 0.6
 PANELS = ("train_return", "train_success", "test_return", "test_success", "entropy", "ent_coef")
 _WALL, _GOAL = "#d62728", "#78c878"
 _VIEW = 1.6
@@ -56,7 +55,8 @@ def curves_figure(evidence: Evidence) -> Figure:
             for agent in experiment.agents:
                 if metric in evidence.columns(setting.name, agent.name):
                     curves = evidence.curves(setting.name, agent.name, metric)
-                    draw_seeds(axes, smoothed(curves), agent.color, agent.label)
+                    smooth = curves.rolling(SMOOTHED_OVER, min_periods=1).mean()
+                    draw_seeds(axes, smooth, agent.color, agent.label)
             _style(axes)
             axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x else "0")
             axes.set_xlim(left=0)
@@ -78,11 +78,6 @@ def curves_figure(evidence: Evidence) -> Figure:
         handles.values(), handles, loc="outside upper center", ncols=len(handles), frameon=False
     )
     return figure
-
-
-def smoothed(curves: pd.DataFrame) -> pd.DataFrame:
-    """Average over evaluations as drawn."""
-    return curves.rolling(SMOOTHED_OVER, min_periods=1).mean()
 
 
 def draw_seeds(axes: Axes, curves: pd.DataFrame, shade: str, label: str) -> None:
@@ -144,7 +139,7 @@ def outcomes_figure(evidence: Evidence) -> Figure | None:
         if evidence.solved_once(*pair).any():
             steps = interquartile_mean(evidence.steps_until_solved(*pair))
             text += f"\n{float(steps.value):,.0f} steps"
-        shade = "white" if share > _DARK else "black"
+        shade = "white" if share > 0.6 else "black"  # the fields darken with the share
         axes.text(column, row, text, ha="center", va="center", fontsize=8, color=shade)
     if np.isnan(shares).all():
         return None
@@ -217,8 +212,6 @@ def _draw_tunnel(axes: Axes, env: Any) -> None:
 
 
 def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:
-    from matplotlib.patches import Rectangle
-
     x, y = picture["positions"][k]
     trail = np.array(picture["trail"])[: picture["steps"][k] + 1]
     reach, view = env.config.reach, _VIEW * env.config.reach

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.exploration_claims import EXPLORATION_CLAIMS
 from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS

@@ -114,17 +114,14 @@ class DeterministicEpisodes:
         self.venv.close()
 
 
-def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[float]] | None:
-    """Estimate the entropy at points of the centre line from start to goal.
+def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[float]]:
+    """Estimate the entropy at points of a Tunnel's center line from start to goal.
 
     Returns:
-        ``way``, fractions of the way to the goal in [0, 1), and ``entropy`` in nats; None for
-        environments other than the Tunnel.
+        ``way``, fractions of the way to the goal in [0, 1), and ``entropy`` in nats.
     """
-    env = make_env(env_id).unwrapped
-    config = getattr(env, "config", None)
-    if config is None or not hasattr(config, "geometry"):
-        return None
+    tunnel: Any = make_env(env_id).unwrapped
+    config = tunnel.config
     way = np.arange(PROFILE_POINTS) / PROFILE_POINTS
     points = np.stack([config.geometry.point(arc) for arc in way * _arc_to_goal(config.geometry)])
     if config.path == "circle":

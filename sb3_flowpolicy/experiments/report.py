@@ -76,8 +76,7 @@ class Section:
     def __init__(self, evidence: Evidence) -> None:
         self.evidence, self.experiment = evidence, evidence.experiment
         self.verdict, findings = evidence.judge()
-        self.measured = bool(evidence.measured)
-        self.table = results_table(evidence) if self.measured else None
+        self.table = results_table(evidence) if evidence.measured else None
         self.facts = facts(evidence)
         self.missing = what_is_missing(self.experiment)
         self.steps = sum(item.all_steps for item in work.make_plan(self.experiment).items)
@@ -100,9 +99,7 @@ class Section:
         return verdict + (f" ({self.reservation})" if self.reservation else "")
 
     def pictures(self) -> dict[str, Figure]:
-        """Return the still pictures by name."""
-        if not self.measured:
-            return {}
+        """Return the figures of measured agents by name."""
         found = {
             "outcomes": figures.outcomes_figure(self.evidence),
             "curves": figures.curves_figure(self.evidence),
@@ -187,13 +184,14 @@ def write_docs(results: Path, docs: Path) -> Path:
     parts = [_MARKDOWN_HEAD.format(method=METHOD), markdown(overview) + "\n"]
     for section in sections:
         name, images = section.experiment.name, {}
-        for kind, figure in section.pictures().items():
-            images[kind] = f"experiments/{name}-{kind}.png"
-            (docs / images[kind]).write_bytes(png(figure, dpi=80))
+        if section.table is not None:
+            for kind, figure in section.pictures().items():
+                images[kind] = f"experiments/{name}-{kind}.png"
+                (docs / images[kind]).write_bytes(png(figure, dpi=80))
+            if data.resolve() != results.resolve():
+                unwanted = shutil.ignore_patterns(".*", "agents", "checkpoints")
+                shutil.copytree(results / name, data / name, ignore=unwanted, dirs_exist_ok=True)
         parts.append(_markdown(section, images))
-        if section.measured and data.resolve() != results.resolve():
-            unwanted = shutil.ignore_patterns(".*", "agents", "checkpoints")
-            shutil.copytree(results / name, data / name, ignore=unwanted, dirs_exist_ok=True)
     page = docs / "experiments.md"
     write_text(page, "\n".join(parts))
     return page

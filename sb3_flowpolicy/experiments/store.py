@@ -31,7 +31,7 @@ import pandas as pd
 from sb3_flowpolicy.common.files import read_json, write_json
 
 SCHEMA = 1
-"""Version of the files; raised when they change their meaning."""
+"""Version of the files; increased when their meaning changes."""
 
 BASIC_COLUMNS = (
     *("seed", "step", "episodes", "train_return", "train_success", "test_return"),
@@ -121,7 +121,7 @@ class ItemFiles:
 
     def fingerprint(self) -> dict[str, Any]:
         """Return the lengths of both files and a digest of their contents."""
-        # Devices have no length, and some no end.
+        # Only regular files have a length: reading a device may never end.
         table, details = (
             path.read_bytes() if path.is_file() else b"" for path in (self.table, self.details)
         )

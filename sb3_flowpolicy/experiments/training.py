@@ -74,9 +74,9 @@ class _Training:
         self.groups = [item.seeds] if self.stacked else [(seed,) for seed in item.seeds]
         self.infos = [name for name in measures.TRAINING_INFOS if name in item.measures]
         self.started, self.cpu_started = time.perf_counter(), time.process_time()
-        # Of earlier sessions.
+        # Totals of earlier sessions.
         self.before: dict[str, Any] = {"seconds": 0, "cpu_seconds": 0, "sessions": 0, "commits": []}
-        # At the start: later the files on disk may be of another commit.
+        # Read now, because the source files may change during the run.
         self.machine = machine()
 
     def run(self) -> None:
@@ -118,7 +118,7 @@ class _Training:
             if models[0].num_timesteps < end:
                 progress = {"start": stage, "files": self.files.fingerprint(), **self._totals()}
                 vars(models[0])[_PROGRESS] = progress
-                # More steps than there are: the only checkpoint is that at the end of the call.
+                # More steps than the run has: the only checkpoint is that at the end of the call.
                 every = 2 * item.steps if due else None
                 learner.learn(
                     # The first call counts from zero, that of a resumed run included.
@@ -140,7 +140,7 @@ class _Training:
             self._record("profile", measures.entropy_profile, models)
         tests.close()
         if group == 0:
-            # To draw pictures of; before the item is declared complete.
+            # Kept to draw pictures of it; saved before the item is declared complete.
             self.files.agent.parent.mkdir(exist_ok=True)
             models[0].save(self.files.agent)
         return stage
@@ -179,7 +179,7 @@ class _Training:
         """Return time, number and commits of all sessions so far."""
         return {
             "seconds": self.before["seconds"] + time.perf_counter() - self.started,
-            # On a core of its own; other processes may share this one.
+            # Unlike the time above, this leaves out other processes on the same core.
             "cpu_seconds": self.before["cpu_seconds"] + time.process_time() - self.cpu_started,
             "sessions": self.before["sessions"] + 1,
             "commits": [*self.before["commits"], self.machine["commit"]],
@@ -222,7 +222,5 @@ def _mean(values: list[float]) -> float | None:
 
 
 def _ent_coef(model: SACFlow) -> float:
-    if model.ent_coef_optimizer is None:
-        return model.ent_coef_tensor.item()
-    assert model.log_ent_coef is not None
-    return model.log_ent_coef.detach().exp().item()
+    log = model.log_ent_coef
+    return (model.ent_coef_tensor if log is None else log.detach().exp()).item()

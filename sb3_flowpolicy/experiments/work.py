@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +12,7 @@ import gymnasium as gym
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
-from sb3_flowpolicy.experiments.experiment import Agent, Experiment, Setting
+from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.store import SCHEMA
 
 FIRST_SEED = 1
@@ -95,12 +96,7 @@ class Plan:
 def vary(
     experiment: Experiment, env_kwargs: Mapping[str, Any], agents: Sequence[str] | None = None
 ) -> Experiment:
-    """Return an experiment with other environments or fewer agents, for tuning.
-
-    Args:
-        experiment: The experiment.
-        env_kwargs: Arguments of the environments, in all settings.
-        agents: Names of the agents to keep. Default: all.
+    """Return an experiment with other arguments of its environments or fewer agents, for tuning.
 
     Raises:
         ValueError: If there is no such agent, or an environment does not take these arguments.
@@ -133,59 +129,42 @@ def make_plan(
 ) -> Plan:
     """Turn an experiment into work items.
 
-    Args:
-        experiment: The experiment.
-        profile: ``"full"`` for the experiment's own steps and seeds, ``"quick"`` for a trial.
-        steps: Environment steps per seed. Default: the profile's.
-        seeds: Number of seeds. Default: the profile's.
-        first_seed: The seeds are this one and those after it.
-        seeds_per_item: Most seeds trained in one process: fewer make more items to spread over
-            machines.
+    The profile, ``"full"`` or ``"quick"``, sets ``steps`` per seed and the number of ``seeds``
+    unless they are given. Each item trains at most ``seeds_per_item`` seeds in one process: fewer
+    make more items to spread over machines.
     """
     quick = profile == "quick"
     steps = (QUICK_STEPS if quick else experiment.steps) if steps is None else steps
     seeds = (QUICK_SEEDS if quick else experiment.seeds) if seeds is None else seeds
     chosen = tuple(range(first_seed, first_seed + seeds))
     groups = [chosen[i : i + seeds_per_item] for i in range(0, seeds, seeds_per_item)]
-    items = [
-        _item(experiment, setting, agent, group, steps, len(groups) > 1)
-        for setting in experiment.settings
-        for agent in experiment.agents
-        for group in groups
-    ]
-    return Plan(experiment, steps, chosen, tuple(items))
-
-
-def _item(
-    experiment: Experiment,
-    setting: Setting,
-    agent: Agent,
-    seeds: tuple[int, ...],
-    steps: int,
-    split: bool,
-) -> WorkItem:
-    hyperparameters = load_hyperparameters(agent.algo, setting.env_id)
-    hyperparameters.pop("n_timesteps", None)
-    for overrides in (setting.overrides, agent.overrides):
-        hyperparameters = merge(hyperparameters, overrides)
     # A short run is measured more often, or there would be no curve to look at.
     eval_every = max(1, min(experiment.eval_every, steps // 6))
     between_checkpoints = min(steps / CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS)
-    return WorkItem(
-        key=f"{setting.name}-{agent.name}" + (f"-seeds-{seeds[0]}-{seeds[-1]}" if split else ""),
-        setting=setting.name,
-        agent=agent.name,
-        seeds=seeds,
-        env_id=setting.env_id,
-        env_kwargs=dict(setting.env_kwargs),
-        hyperparameters=hyperparameters,
-        steps=steps,
-        eval_every=eval_every,
-        checkpoint_every=eval_every * max(1, round(between_checkpoints / eval_every)),
-        test_episodes=TEST_EPISODES,
-        measures=experiment.measures,
-        pictures_at=tuple(round(share * steps) for share in experiment.pictures_at),
-    )
+    items = []
+    for setting, agent, group in itertools.product(experiment.settings, experiment.agents, groups):
+        part = f"-seeds-{group[0]}-{group[-1]}" if len(groups) > 1 else ""
+        hyperparameters = load_hyperparameters(agent.algo, setting.env_id)
+        hyperparameters.pop("n_timesteps", None)
+        for overrides in (setting.overrides, agent.overrides):
+            hyperparameters = merge(hyperparameters, overrides)
+        item = WorkItem(
+            key=f"{setting.name}-{agent.name}{part}",
+            setting=setting.name,
+            agent=agent.name,
+            seeds=group,
+            env_id=setting.env_id,
+            env_kwargs=dict(setting.env_kwargs),
+            hyperparameters=hyperparameters,
+            steps=steps,
+            eval_every=eval_every,
+            checkpoint_every=eval_every * max(1, round(between_checkpoints / eval_every)),
+            test_episodes=TEST_EPISODES,
+            measures=experiment.measures,
+            pictures_at=tuple(round(share * steps) for share in experiment.pictures_at),
+        )
+        items.append(item)
+    return Plan(experiment, steps, chosen, tuple(items))
 
 
 def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
