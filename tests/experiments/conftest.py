@@ -109,3 +109,9 @@ def declare_whole(files: ItemFiles) -> None:
     """Note the present contents of files that a test has changed as those of the run."""
     done = json.loads(files.done.read_text())
     files.done.write_text(json.dumps({**done, **files.fingerprint()}))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return what was measured, by file."""
+    files = [path for path in folder.iterdir() if path.suffix in (".csv", ".jsonl")]
+    return {path.name: path.read_bytes() for path in files}

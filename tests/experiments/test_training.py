@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +22,7 @@ from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.training import run_item
 from sb3_flowpolicy.experiments.work import WorkItem, make_plan, merge
 from sb3_flowpolicy.seeds.experience import SeedExperience
+from tests.experiments.conftest import contents
 
 
 @pytest.fixture
@@ -35,12 +34,11 @@ def quiet(key: str, step: int) -> None:
     pass
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        path.name: path.read_bytes()
-        for path in folder.iterdir()
-        if path.suffix in (".csv", ".jsonl")
-    }
+def trained(item: WorkItem, folder: Path) -> dict[str, bytes]:
+    """What an item leaves that is not interrupted."""
+    folder.mkdir()
+    run_item(item, folder, quiet)
+    return contents(folder)
 
 
 def test_everything_is_measured(item: WorkItem, tmp_path: Path) -> None:
@@ -76,25 +74,23 @@ class Crash(BaseException):
     """An error that no handler catches."""
 
 
-GSDE = {"policy": "GaussPolicy", "use_sde": True, "train_freq": 8, "gradient_steps": 8}
+def with_gsde(item: WorkItem) -> WorkItem:
+    """An item whose seeds are trained one after the other."""
+    gsde = {"policy": "GaussPolicy", "use_sde": True, "train_freq": 8, "gradient_steps": 8}
+    return replace(item, hyperparameters=merge(item.hyperparameters, gsde), measures=())
 
 
 @pytest.mark.parametrize(
-    ("crashes", "overrides", "every"),
-    [([0, 3], {}, 20), ([1, 3, 1, 2], {}, 40), ([1, 2, 3, 4], GSDE, 20)],
+    ("crashes", "gsde", "every"),
+    [([0, 3], False, 20), ([1, 3, 1, 2], False, 40), ([1, 2, 3, 4], True, 20)],
 )
 def test_interrupted_runs_end_with_the_same_results(
-    crashes: list[int], overrides: dict[str, Any], every: int, item: WorkItem, tmp_path: Path
+    crashes: list[int], gsde: bool, every: int, item: WorkItem, tmp_path: Path
 ) -> None:
     """A crash after so many reports of a session; half a line is left behind."""
-    hyperparameters = merge(item.hyperparameters, overrides)
-    measures = () if overrides else item.measures
-    item = replace(item, hyperparameters=hyperparameters, measures=measures, checkpoint_every=every)
-    straight, folder = tmp_path / "straight", tmp_path / "interrupted"
-    straight.mkdir()
-    folder.mkdir()
-    run_item(item, straight, quiet)
-    files = ItemFiles(folder, item.key)
+    item = replace(with_gsde(item) if gsde else item, checkpoint_every=every)
+    straight = trained(item, tmp_path / "straight")
+    files = ItemFiles(tmp_path, item.key)
     for count in crashes:
         reports = []
 
@@ -106,10 +102,10 @@ def test_interrupted_runs_end_with_the_same_results(
                 raise Crash
 
         with pytest.raises(Crash):
-            run_item(item, folder, crash)
+            run_item(item, tmp_path, crash)
         assert not files.finished
-    run_item(item, folder, quiet)
-    assert contents(folder) == contents(straight)
+    run_item(item, tmp_path, quiet)
+    assert contents(tmp_path) == straight
     done = files.read_done(item.steps, item.seeds)
     assert done is not None
     assert done["steps"] == 120
@@ -119,10 +115,7 @@ def test_a_run_that_was_told_to_stop_finishes_its_stage_later(
     item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """SIGTERM writes a checkpoint between two measurements."""
-    straight, folder = tmp_path / "straight", tmp_path / "stopped"
-    straight.mkdir()
-    folder.mkdir()
-    run_item(item, straight, quiet)
+    straight = trained(item, tmp_path / "straight")
     step = SeedExperience.step
 
     def stop_at_50(self: SeedExperience, runtime: EngineRuntime) -> tuple:
@@ -133,10 +126,10 @@ def test_a_run_that_was_told_to_stop_finishes_its_stage_later(
     with monkeypatch.context() as patch:
         patch.setattr(SeedExperience, "step", stop_at_50)
         with pytest.raises(SystemExit):
-            run_item(item, folder, quiet)
-    assert list(ItemFiles(folder, item.key).checkpoints.glob("*/*-step-51"))
-    run_item(item, folder, quiet)
-    assert contents(folder) == contents(straight)
+            run_item(item, tmp_path, quiet)
+    assert list(ItemFiles(tmp_path, item.key).checkpoints.glob("*/*-step-51"))
+    run_item(item, tmp_path, quiet)
+    assert contents(tmp_path) == straight
 
 
 def _interrupt(item: WorkItem, folder: Path) -> ItemFiles:
@@ -175,12 +168,9 @@ def test_a_number_changed_behind_a_checkpoint_is_noticed(item: WorkItem, tmp_pat
     assert files.finished
 
 
-@pytest.mark.parametrize("overrides", [{}, GSDE], ids=["batch", "separate"])
-def test_damaged_checkpoints_are_named(
-    overrides: dict[str, Any], item: WorkItem, tmp_path: Path
-) -> None:
-    hyperparameters = merge(item.hyperparameters, overrides)
-    item = replace(item, hyperparameters=hyperparameters, measures=(), pictures_at=())
+@pytest.mark.parametrize("gsde", [False, True])
+def test_damaged_checkpoints_are_named(gsde: bool, item: WorkItem, tmp_path: Path) -> None:
+    item = with_gsde(item) if gsde else item
     files = _interrupt(item, tmp_path)
     table = files.table.read_bytes()
     for path in (path for path in files.checkpoints.rglob("*") if path.suffix != ".json"):
@@ -193,28 +183,21 @@ def test_damaged_checkpoints_are_named(
 
 def test_one_damaged_checkpoint_costs_only_time(item: WorkItem, tmp_path: Path) -> None:
     """Rows are cut to the older checkpoint, too."""
-    straight, folder = tmp_path / "straight", tmp_path / "damaged"
-    straight.mkdir()
-    folder.mkdir()
-    run_item(item, straight, quiet)
-    files = _interrupt(item, folder)
+    straight = trained(item, tmp_path / "straight")
+    files = _interrupt(item, tmp_path)
     newest = max(files.checkpoints.glob("*/*-step-*"))
     (newest / "state.pt").write_bytes(b"")
     with pytest.warns(RuntimeWarning, match="newer checkpoints are damaged"):
-        run_item(item, folder, quiet)
-    assert contents(folder) == contents(straight)
+        run_item(item, tmp_path, quiet)
+    assert contents(tmp_path) == straight
 
 
-@pytest.mark.parametrize("overrides", [{}, GSDE], ids=["batch", "separate"])
+@pytest.mark.parametrize("gsde", [False, True])
 def test_a_crash_while_saving_leaves_the_last_checkpoint(
-    overrides: dict[str, Any], item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gsde: bool, item: WorkItem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hyperparameters = merge(item.hyperparameters, overrides)
-    item = replace(item, hyperparameters=hyperparameters, measures=(), pictures_at=())
-    straight, folder = tmp_path / "straight", tmp_path / "broken"
-    straight.mkdir()
-    folder.mkdir()
-    run_item(item, straight, quiet)
+    item = with_gsde(item) if gsde else item
+    straight = trained(item, tmp_path / "straight")
     writes = []
     collect = state.collect
 
@@ -227,11 +210,11 @@ def test_a_crash_while_saving_leaves_the_last_checkpoint(
     with monkeypatch.context() as patch:
         patch.setattr(state, "collect", fail_at_third)
         with pytest.raises(Crash):
-            run_item(item, folder, quiet)
+            run_item(item, tmp_path, quiet)
     steps: list[int] = []
-    run_item(item, folder, lambda key, step: steps.append(step))
+    run_item(item, tmp_path, lambda key, step: steps.append(step))
     assert steps[0] == 0
-    assert contents(folder) == contents(straight)
+    assert contents(tmp_path) == straight
 
 
 class Locked(gym.Wrapper):
@@ -270,15 +253,3 @@ def test_two_processes_do_not_share_an_item(
         pytest.raises(ValueError, match="another is at work on circle-flow"),
     ):
         run_item(item, tmp_path, quiet)
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
-def test_a_full_disk_is_an_error_that_names_the_file(item: WorkItem, tmp_path: Path) -> None:
-    files = ItemFiles(tmp_path, item.key)
-    files.table.symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left on device"):
-        run_item(item, tmp_path, quiet)
-    assert not files.finished
-    files.table.unlink()
-    run_item(item, tmp_path, quiet)
-    assert len(files.read_table()) == 12
