@@ -220,7 +220,7 @@ def is_steady(setting: str, agent: Agent, share: float) -> Check:
 
 
 def _final(setting: str, metric: str) -> str:
-    return f"{setting}: final {WORDS.get(metric, metric)} (IQM)"
+    return f"{setting}: final {WORDS[metric]} (IQM)"
 
 
 def _means(

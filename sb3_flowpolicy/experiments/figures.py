@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PANELS = ("train_return", "train_success", "test_return", "test_success", "entropy", "ent_coef")
 _WALL, _GOAL = "#d62728", "#78c878"
 _VIEW = 1.6
 """Half the edge of a view of the agent, in reaches."""
@@ -39,7 +38,7 @@ def panels(evidence: Evidence) -> list[str]:
         if "ent_coef" in columns
     ):
         names.discard("ent_coef")
-    return [name for name in (*PANELS, *sorted(names - set(PANELS))) if name in names]
+    return [name for name in WORDS if name in names]
 
 
 def curves_figure(evidence: Evidence) -> Figure:
@@ -67,7 +66,7 @@ def curves_figure(evidence: Evidence) -> Figure:
         if len(grid) > 1:
             row[0].set_ylabel(setting.name, fontsize=10)
     for above, below, metric in zip(grid[0], grid[-1], metrics, strict=True):
-        above.set_title(WORDS.get(metric, metric), fontsize=10)
+        above.set_title(WORDS[metric], fontsize=10)
         below.set_xlabel("environment steps", fontsize=8)
     handles = {
         label: handle

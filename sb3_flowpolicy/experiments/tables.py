@@ -16,10 +16,10 @@ WORDS = {
     "entropy": "entropy",
     "ent_coef": "entropy coefficient",
     "same_axis_correlation": "correlation of same-axis actions",
-    "x_std": "standard deviation of x",
     "x_max": "greatest distance along x",
+    "x_std": "standard deviation of x",
 }
-"""Names of metrics in sentences."""
+"""Names of metrics in sentences, in the order of the figures."""
 
 _DECIMALS = {"ent_coef": 4, "x_std": 3, "x_max": 3}
 
@@ -50,7 +50,7 @@ def results_table(evidence: Evidence) -> pd.DataFrame:
             row["steps until solved"] = f"{steps:,.0f}" if once.any() else "never"
         for name, final in finals.items():
             row["seeds"] = str(len(final))
-            row[WORDS.get(name, name)] = in_digits(name, interquartile_mean(final))
+            row[WORDS[name]] = in_digits(name, interquartile_mean(final))
         rows.append(row)
     return pd.DataFrame(rows).fillna("-")
 
