@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.exploration_claims import EXPLORATION_CLAIMS
-from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS
+from sb3_flowpolicy.experiments.further_claims import BULLET_CLAIMS, SQUARE_CLAIMS
 from sb3_flowpolicy.experiments.tunnel_claims import TUNNEL_CLAIMS
 from sb3_flowpolicy.experiments.work import register_env
 
 EXPERIMENTS: dict[str, Experiment] = {
-    one.name: one
-    for one in (
-        *FURTHER_CLAIMS[:2],
-        *TUNNEL_CLAIMS,
-        *FURTHER_CLAIMS[2:],
-        *EXPLORATION_CLAIMS,
-    )
+    one.name: one for one in (*BULLET_CLAIMS, *TUNNEL_CLAIMS, *SQUARE_CLAIMS, *EXPLORATION_CLAIMS)
 }
 """Name to experiment, in the order of the claims."""
 

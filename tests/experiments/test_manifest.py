@@ -29,9 +29,6 @@ def test_entries_are_complete(experiment: Experiment) -> None:
     assert experiment.checks
     names = [setting.name for setting in experiment.settings]
     assert len(set(names)) == len(names)
-    # Runs of a million steps, and runs of 200 000 with large networks, have fewer seeds.
-    least = {"E1": 3, "E7": 5, "E8": 5, "E9": 5, "E10": 3, "E11": 5}.get(experiment.claim, 10)
-    assert experiment.seeds >= least
     for check in experiment.checks:
         assert any(check.statement.startswith(f"{name}: ") for name in names)
     if what_is_missing(experiment) is None:
@@ -77,9 +74,9 @@ def test_a_worker_process_can_make_bullet_environments() -> None:
     pytest.importorskip("pybullet_envs_gymnasium")
     code = (
         "import gymnasium as gym\n"
-        "from sb3_flowpolicy.experiments.further_claims import FURTHER_CLAIMS\n"
+        "from sb3_flowpolicy.experiments.further_claims import BULLET_CLAIMS\n"
         "from sb3_flowpolicy.experiments.work import environment, make_plan\n"
-        "print(gym.spec(environment(make_plan(FURTHER_CLAIMS[0]).items[0])).id)"
+        "print(gym.spec(environment(make_plan(BULLET_CLAIMS[0]).items[0])).id)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.stdout.endswith("Walker2DBulletEnv-v0\n"), result.stderr
