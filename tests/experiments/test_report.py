@@ -127,14 +127,6 @@ def test_outcomes_are_counted_per_agent_and_setting(make_up: MakeUp, tmp_path: P
     assert outcomes_figure(evidence("circle-fixed-alpha", tmp_path)) is None
 
 
-def test_a_try_out_is_no_result(make_up: MakeUp, tmp_path: Path) -> None:
-    make_up("sparse-fixed-entropy", seeds=3)
-    section = Section(evidence("sparse-fixed-entropy", tmp_path))
-    assert section.reservation == "trial, not a result"
-    make_up("circle-narrow")
-    assert Section(evidence("circle-narrow", tmp_path)).reservation is None
-
-
 def test_our_experiments_reproduce_nothing(make_up: MakeUp, tmp_path: Path) -> None:
     make_up("diagonal-dimensions", {"4-dimensions-flow": 0.0})
     section = Section(evidence("diagonal-dimensions", tmp_path))
