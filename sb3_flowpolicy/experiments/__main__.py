@@ -17,14 +17,7 @@ OUT = {"full": Path("logs/experiments"), "quick": Path("logs/experiments-quick")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command.
-
-    Args:
-        arguments: Command line without the program's name. Default: that of the process.
-
-    Returns:
-        Exit status: 0 if all went well, 1 if not, 130 if interrupted.
-    """
+    """Run the command line; return the exit status, 1 after an error, 130 if interrupted."""
     args = _parser().parse_args(arguments)
     try:
         args.command(args)

@@ -43,12 +43,8 @@ class Evidence:
     """Results of one experiment.
 
     Curves are data frames with a row per step and a column per seed; other results are arrays with
-    a value per seed, (S,).
-
-    Args:
-        experiment: The experiment.
-        folder: Its folder, complete or not.
-        others: From the name of another experiment to its evidence, if there is any.
+    a value per seed, (S,). The folder need not be complete; ``others`` returns the evidence of
+    another experiment by its name.
 
     Raises:
         ValueError: If a file is corrupt, or was changed since its item was finished.

@@ -126,11 +126,7 @@ def reservation(experiment: Experiment, settings: dict[str, Any]) -> str | None:
 
 
 def read_results(results: Path) -> list[Evidence]:
-    """Read the results of all experiments in a folder that ``run`` wrote.
-
-    Raises:
-        ValueError: If the folder holds no results, or a file is corrupt.
-    """
+    """Read the results of all experiments in a folder; raise ``ValueError`` if there are none."""
 
     @functools.cache
     def one(name: str) -> Evidence:
@@ -146,11 +142,7 @@ def read_results(results: Path) -> list[Evidence]:
 
 
 def write_report(results: Path, page: Path) -> Path:
-    """Write one HTML page that needs no other files and no network.
-
-    Raises:
-        ValueError: If there are no results, or a file is corrupt.
-    """
+    """Write one HTML page that needs no other files and no network."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("sb3_flowpolicy.experiments", package_path="")

@@ -46,9 +46,6 @@ With the default budget, a family takes about half a minute on one core. The obj
 compare searches with other --seed values before you rely on a small difference."""
 
 
-_OPTIONS = ("ent_coef", "gamma", "episodes", "budget", "seed")
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -64,9 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **pairs)
     add("--ent-coef", type=float, default=0.05, help="entropy coefficient (default: 0.05)")
     add("--gamma", type=float, default=0.9, help="discount factor (default: 0.9)")
-    names = ("independent", "pink", "rank 2", "full")
-    some = f"some of {', '.join(map(repr, names))} (default: all)"
-    add("--families", nargs="+", choices=names, default=names, metavar="NAME", help=some)
+    known = ("independent", "pink", "rank 2", "full")
+    some = f"some of {', '.join(map(repr, known))} (default: all)"
+    add("--families", nargs="+", choices=known, default=known, metavar="NAME", help=some)
     add("--budget", type=int, default=800, help="candidates per family (default: 800)")
     add("--episodes", type=int, default=48, help="episodes per candidate (default: 48)")
     add("--seed", type=int, default=0, help="seed of the search (default: 0)")
@@ -83,7 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
 
-    options = {name: getattr(args, name) for name in _OPTIONS}
+    names = ("ent_coef", "gamma", "episodes", "budget", "seed")
+    options = {name: getattr(args, name) for name in names}
     try:
         setting = setting_of(args.env, dict(args.task), dict(args.set), **options)
     except (ValueError, TypeError) as error:

@@ -86,8 +86,8 @@ def independent(parameters: Array) -> Array:
 def rank_2(parameters: Array) -> Array:
     """Return the root (8, 10) of diag + V V^T, where V moves all fingers along x and along y.
 
-    The parameters (8,) are those of `independent`, and for either column of V how far the fingers
-    move that press along the axis, and the others.
+    The parameters (8,) are those of `independent`, then two for each column of V: how far the
+    fingers that press along its axis move, and how far the other two move.
     """
     columns = [
         first * MODES[name][0] + second * MODES[name][1]

@@ -20,9 +20,9 @@ FILM_LEAD = 4
 """Steps of the warm-up that a film shows: one second."""
 FILM_SIZE = 256
 ATTEMPTS = 10
-"""Episodes among which the one that is shown step by step is found."""
+"""Most episodes to play until one is found, for the film, in which the square is not lost."""
 N_SAMPLES, N_SHOWN = 1300, 300
-"""Sampled actions per state; all but those shown serve to find how the fingers move together."""
+"""Sampled actions per state, and those shown; the others tell how the fingers move together."""
 MEASURED_STATES, MEASURED_SAMPLES = 256, 1024
 
 
@@ -73,7 +73,7 @@ class Recording(NamedTuple):
         frames: Pictures of the same episode from a second before, (size, size, 3) each.
         paths: x of the square after the warm-up in E sampled episodes of up to T steps, NaN
             once they have ended, (E, T).
-        dropped: In which of them the square fell or a finger broke, (E,).
+        dropped: Whether the square fell or a finger broke in each of them, (E,).
         correlation: Mean absolute correlation of the actions given the state, over states of these
             episodes after the warm-up, (8, 8).
         entropy: Mean entropy of the squashed policy over the same states, nats.
@@ -111,19 +111,12 @@ def load_agent(path: Path, env_id: str) -> SACFlow:
 
 
 def record(label: str, model: SACFlow, env_id: str, seed: int, n_episodes: int) -> Recording:
-    """Play the episodes that the pictures show.
+    """Play the episodes that the pictures show, with ``seed`` and the seeds after it.
 
-    The episode that is filmed is the first of ``ATTEMPTS`` in which the square is not lost, else
-    the first of all. It is deterministic during the warm-up, so that all agents start to explore
-    from similar states, and sampled afterwards. Those for paths and correlation are all kept,
-    whatever their end, and sampled from the start.
-
-    Args:
-        label: Name of the agent.
-        model: From :func:`load_agent`.
-        env_id: Task.
-        seed: Of the first episode; the others follow.
-        n_episodes: Number of episodes for the paths and the correlation, at least 1.
+    The film shows the first of ``ATTEMPTS`` episodes in which the square is not lost, or else the
+    first of all. This episode is deterministic during the warm-up, so that all agents start to
+    explore from similar states, and sampled afterwards. The ``n_episodes`` of paths and correlation
+    are sampled from the start and kept whatever their end.
 
     Raises:
         ValueError: If the agent always breaks a finger before the end of the warm-up.

@@ -20,14 +20,9 @@ _TESTS = 10
 
 
 def train(task: Task, algorithm: str, name: str, seed: int, episodes: int) -> list[tuple[Any, ...]]:
-    """Train an agent and test it ten times, deterministically.
+    """Train an agent, ``CANDIDATES[algorithm][name]``, and test it ten times, deterministically.
 
-    Args:
-        task: The task.
-        algorithm: Key of ``CANDIDATES``.
-        name: Key of the candidate.
-        seed: Seed of agent and environments; those of the tests differ.
-        episodes: Number of episodes per test.
+    The environments of the tests have other seeds than that of training.
 
     Returns:
         Step, mean return, share of successes (NaN if the task has none), and seconds since the
