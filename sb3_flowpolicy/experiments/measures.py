@@ -71,29 +71,28 @@ TRAINING_INFOS = ("x_std", "x_max")
 
 
 class DeterministicEpisodes:
-    """Deterministic episodes of several policies, all stepped at once."""
+    """Deterministic episodes of several policies, all stepped at once.
 
-    def __init__(self, env: str, n_models: int, n_episodes: int) -> None:
-        self.n_models, self.n_episodes = n_models, n_episodes
-        self.venv: VectorEnv = make_vec_env(env, n_models * n_episodes)
+    They start from the same seeds every time, far from those of training.
+    """
 
-    def run(
-        self, models: Sequence[EngineFlow], seeds: tuple[int, ...]
-    ) -> list[tuple[float, float | None]]:
-        """Return mean return and success rate of each policy.
+    def __init__(self, env: str, seeds: Sequence[int], n_episodes: int) -> None:
+        self.starts = [10**6 * (seed + 1) + k for seed in seeds for k in range(n_episodes)]
+        self.venv: VectorEnv = make_vec_env(env, len(self.starts))
 
-        Episodes start from the same seeds at every call, far from those of training. The success
-        rate is None if the environment does not report success.
+    def run(self, models: Sequence[EngineFlow]) -> list[tuple[float, float | None]]:
+        """Return mean return and success rate of each policy, one per seed.
+
+        The success rate is None if the environment does not report success.
         """
-        offsets = [10**6 * (seed + 1) + k for seed in seeds for k in range(self.n_episodes)]
-        obs, _ = self.venv.reset(seed=offsets)  # type: ignore[arg-type]
-        count = len(offsets)
+        obs, _ = self.venv.reset(seed=self.starts)  # type: ignore[arg-type]
+        count = len(self.starts)
         returns, running = np.zeros(count), np.ones(count, dtype=bool)
         success = np.full(count, np.nan)
         while running.any():
             actions = [
                 model.predict(part, deterministic=True)[0]
-                for model, part in zip(models, np.split(obs, self.n_models), strict=True)
+                for model, part in zip(models, np.split(obs, len(models)), strict=True)
             ]
             obs, rewards, terminated, truncated, infos = self.venv.step(np.concatenate(actions))
             returns += rewards * running
@@ -102,8 +101,7 @@ class DeterministicEpisodes:
             if reported is not None:
                 success[ended] = np.asarray(reported)[ended]
             running &= ~ended
-        shape = (self.n_models, self.n_episodes)
-        means, rates = returns.reshape(shape).mean(1), success.reshape(shape).mean(1)
+        means, rates = (values.reshape(len(models), -1).mean(1) for values in (returns, success))
         return [
             (float(mean), None if np.isnan(rate) else float(rate))
             for mean, rate in zip(means, rates, strict=True)

@@ -108,7 +108,7 @@ class _Training:
         models = learner.models if isinstance(learner, SeedBatch) else [learner]
         stage = vars(models[0]).get(_PROGRESS, {"start": 0})["start"]
         self._tell(group, stage)
-        tests = measures.DeterministicEpisodes(self.env, len(models), item.test_episodes)
+        tests = measures.DeterministicEpisodes(self.env, self.groups[group], item.test_episodes)
         first = True
         while stage < item.steps:
             end = min(stage + item.eval_every, item.steps)
@@ -130,7 +130,7 @@ class _Training:
                 )
                 first = False
             done = models[0].num_timesteps
-            tested = tests.run(models, self.groups[group])
+            tested = tests.run(models)
             self.files.append_rows([self._row(*one) for one in zip(models, tested, strict=True)])
             if group == 0 and any(stage < at <= done for at in item.pictures_at):
                 self._record("picture", measures.policy_picture, models[:1])
