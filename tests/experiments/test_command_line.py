@@ -93,16 +93,6 @@ def test_wrong_arguments_are_errors_that_help(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written(
-    tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert main(["run", "tiny", "--out", str(tmp_path / "file")]) == 1
-    error = capsys.readouterr().err
-    assert "Not a directory" in error
-    assert "the same command continues" in error
-
-
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
 def test_a_full_disk_ends_the_run_with_one_sentence(
     tiny: Experiment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
