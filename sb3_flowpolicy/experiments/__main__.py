@@ -82,14 +82,15 @@ def _run(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    from sb3_flowpolicy.experiments.report import write_docs, write_report
+    from sb3_flowpolicy.experiments.report import read_results, write_docs, write_report
 
     if args.html is not None and args.html.is_dir():
         raise ValueError(f"--html must be a file, got the folder {args.html}")
-    page = write_report(args.results, args.html or args.results / "report.html")
+    sections, page = read_results(args.results), args.html or args.results / "report.html"
+    write_report(sections, page)
     print(f"Report: {page}")
     if args.docs is not None:
-        print(f"Tables, figures and data: {write_docs(args.results, args.docs)}")
+        print(f"Tables, figures and data: {write_docs(sections, args.docs)}")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import functools
 import io
-import json
 import shutil
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,12 +121,12 @@ def reservation(experiment: Experiment, settings: dict[str, Any]) -> str | None:
     same = work.make_plan(
         experiment, steps=settings["steps"], seeds=len(seeds), seeds_per_item=together
     )
-    found = differences(settings, json.loads(json.dumps(same.settings())))
+    found = differences(settings, same.settings())
     return f"made with other settings ({found[0]})" if found else None
 
 
-def read_results(results: Path) -> list[Evidence]:
-    """Read the results of all experiments in a folder; raise ``ValueError`` if there are none."""
+def read_results(results: Path) -> list[Section]:
+    """Judge the results of all experiments in a folder; raise ``ValueError`` if there are none."""
 
     @functools.cache
     def one(name: str) -> Evidence:
@@ -138,16 +138,15 @@ def read_results(results: Path) -> list[Evidence]:
             f"{results} must hold the results of at least one experiment, got none: "
             "python -m sb3_flowpolicy.experiments run NAME makes some"
         )
-    return found
+    return [Section(evidence) for evidence in found]
 
 
-def write_report(results: Path, page: Path) -> Path:
+def write_report(sections: Sequence[Section], page: Path) -> None:
     """Write one HTML page that needs no other files and no network."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("sb3_flowpolicy.experiments", package_path="")
     templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-    sections = [Section(evidence) for evidence in read_results(results)]
     text = templates.get_template("report.html").render(
         sections=sections,
         method=METHOD,
@@ -157,14 +156,16 @@ def write_report(results: Path, page: Path) -> Path:
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     write_text(page, text)
-    return page
 
 
-def write_docs(results: Path, docs: Path) -> Path:
-    """Write ``experiments.md`` into the docs' results, its figures, and a copy of the data."""
+def write_docs(sections: Sequence[Section], docs: Path) -> Path:
+    """Write ``experiments.md`` into the docs' results, its figures, and a copy of the data.
+
+    Returns:
+        The page.
+    """
     data = docs / "experiments"
     data.mkdir(parents=True, exist_ok=True)
-    sections = [Section(evidence) for evidence in read_results(results)]
     overview = pd.DataFrame(
         [
             (one.claim, f"[`{one.name}`](#{one.name})", one.title, section.verdict_in_words)
@@ -180,9 +181,10 @@ def write_docs(results: Path, docs: Path) -> Path:
             for kind, figure in section.pictures().items():
                 images[kind] = f"experiments/{name}-{kind}.png"
                 (docs / images[kind]).write_bytes(png(figure, dpi=80))
-            if data.resolve() != results.resolve():
+            source, copy = section.evidence.folder, data / name
+            if copy.resolve() != source.resolve():
                 unwanted = shutil.ignore_patterns(".*", "agents", "checkpoints")
-                shutil.copytree(results / name, data / name, ignore=unwanted, dirs_exist_ok=True)
+                shutil.copytree(source, copy, ignore=unwanted, dirs_exist_ok=True)
         parts.append(_markdown(section, images))
     page = docs / "experiments.md"
     write_text(page, "\n".join(parts))

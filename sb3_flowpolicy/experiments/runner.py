@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import queue
@@ -44,7 +43,7 @@ def results_folder(out: Path, plan: Plan) -> Iterator[Path]:
         with FileLock(folder / ".run.lock", timeout=0):
             if not path.exists():
                 write_json(path, settings)
-            if found := differences(read_json(path), json.loads(json.dumps(settings))):
+            if found := differences(read_json(path), settings):
                 raise ValueError(
                     f"{folder} must hold results of the same settings, got others "
                     f"({'; '.join(found[:5])}). Choose another folder with --out, or use the "

@@ -58,11 +58,9 @@ def results_table(evidence: Evidence) -> pd.DataFrame:
 def facts(evidence: Evidence) -> dict[str, str]:
     """Return the origin of the results: command, seeds, cost, commit, machine."""
     experiment, done = evidence.experiment, [one for one in evidence.done.values() if one]
-    seeds = evidence.settings.get("seeds", [])
-    steps = evidence.settings.get("steps", experiment.steps)
-    command = f"python -m sb3_flowpolicy.experiments run {experiment.name}"
-    found = {"command": command}
+    found = {"command": f"python -m sb3_flowpolicy.experiments run {experiment.name}"}
     if evidence.items:
+        steps, seeds = evidence.settings["steps"], evidence.settings["seeds"]
         for option, value, usual in (
             ("steps", steps, experiment.steps),
             ("seeds", len(seeds), experiment.seeds),

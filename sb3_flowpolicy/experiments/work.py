@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -77,20 +78,21 @@ class Plan:
     items: tuple[WorkItem, ...]
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that results depend on; runs that share a folder agree on it."""
+        """Return all that results depend on, as JSON; runs that share a folder agree on it."""
         items = {}
         for item in self.items:
             spec = gym.spec(item.env_id)
             registration = {"kwargs": spec.kwargs, "max_episode_steps": spec.max_episode_steps}
             items[item.key] = {**vars(item), "env_registration": registration}
             del items[item.key]["key"]
-        return {
+        settings = {
             "schema": SCHEMA,
             "experiment": self.experiment.name,
             "steps": self.steps,
-            "seeds": list(self.seeds),
+            "seeds": self.seeds,
             "items": items,
         }
+        return json.loads(json.dumps(settings))
 
 
 def vary(

@@ -106,15 +106,14 @@ def test_results_that_are_not_the_experiments_own_are_marked() -> None:
     experiment = EXPERIMENTS[NAME]
 
     def said(**changes: Any) -> str | None:
-        plan = make_plan(experiment, **changes)
-        return reservation(experiment, json.loads(json.dumps(plan.settings())))
+        return reservation(experiment, make_plan(experiment, **changes).settings())
 
     assert said() is None
     assert said(seeds=12) is None
     assert said(seeds_per_item=4) is None
     assert said(steps=100) == "trial, not a result"
     assert said(first_seed=100) == "seeds from 100 on, which are for tuning: not a result"
-    other = json.loads(json.dumps(make_plan(experiment).settings()))
+    other = make_plan(experiment).settings()
     other["items"]["narrow-flow"]["hyperparameters"]["gamma"] = 0.5
     assert reservation(experiment, other) == (
         "made with other settings (items.narrow-flow.hyperparameters.gamma: there 0.5, now 0.8)"
@@ -131,7 +130,7 @@ def test_an_agent_that_was_added_later_leaves_the_claim_open(
     monkeypatch.setitem(EXPERIMENTS, NAME, grown)
     evidence = Evidence(grown, tmp_path / NAME)
     assert evidence.judge()[0] == NOT_MEASURED
-    assert reservation(grown, evidence.settings or {}) == "trial, not a result"
+    assert reservation(grown, evidence.settings) == "trial, not a result"
 
 
 def test_what_was_not_measured_leaves_the_claim_open(make_up: MakeUp, tmp_path: Path) -> None:

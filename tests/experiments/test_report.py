@@ -140,20 +140,21 @@ def test_our_experiments_reproduce_nothing(make_up: MakeUp, tmp_path: Path) -> N
 def test_docs_hold_tables_figures_and_data(make_up: MakeUp, tmp_path: Path) -> None:
     make_up("circle-fixed-entropy", seeds=3)
     docs = tmp_path / "docs"
-    text = write_docs(tmp_path, docs).read_text()
+    text = write_docs(read_results(tmp_path), docs).read_text()
     for link in re.findall(r"\]\((experiments/[^)]+\.png)\)", text):
         assert (docs / link).read_bytes().startswith(b"\x89PNG")
     assert len(re.findall(r"!\[circle-fixed-entropy", text)) == 3
     assert f"| circle | {GAUSS.label} | 3 |" in text
     assert "trial, not a result" in text
     # What is committed is enough to make the page again.
-    again = [one.experiment.name for one in read_results(docs / "experiments") if one.complete]
-    assert again == ["circle-fixed-entropy"]
+    again = [one for one in read_results(docs / "experiments") if one.evidence.complete]
+    assert [one.experiment.name for one in again] == ["circle-fixed-entropy"]
 
 
 def test_the_page_needs_no_other_file(make_up: MakeUp, tmp_path: Path) -> None:
     make_up("circle-fixed-entropy", seeds=3)
-    text = write_report(tmp_path, tmp_path / "report.html").read_text()
+    write_report(read_results(tmp_path), tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!#|data:)', text)
     assert text.count('src="data:image/png;base64,') == 3
     assert "Policies in their tunnel" in text
