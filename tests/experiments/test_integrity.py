@@ -15,7 +15,7 @@ from sb3_flowpolicy.experiments.evidence import Evidence
 from sb3_flowpolicy.experiments.experiment import GAUSS, NOT_MEASURED, Experiment
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.report import reservation
-from sb3_flowpolicy.experiments.store import ItemFiles, read_settings
+from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import make_plan
 from tests.experiments.conftest import MakeUp, declare_whole
 
@@ -42,64 +42,25 @@ def test_changed_results_stop_the_run_and_the_report(
 
 
 @pytest.mark.parametrize(
-    ("facts", "message"),
+    ("file", "change", "message"),
     [
-        ({"key": "narrow-gauss"}, "must be of narrow-flow, got 'narrow-gauss'"),
-        ({"seeds": [9, 1]}, r"must be of 120000 steps of seeds \[1, 2\], got 120000 of \[9, 1\]"),
-        ({"steps": 5000}, r"must be of 120000 steps of seeds \[1, 2\], got 5000 of \[1, 2\]"),
+        ("settings", {"steps": None}, r"must hold 'steps' \(int\)"),
+        ("settings", {"schema": 99}, "must be of schema 1, got 99"),
+        ("settings", {"experiment": "move"}, "named after its experiment, 'move', got 'circle-"),
+        ("narrow-flow.done", {"machine": None}, r"must hold 'machine' \(dict\)"),
+        ("narrow-flow.done", {"key": "narrow-gauss"}, "must be of narrow-flow, got 'narrow-gauss'"),
+        ("narrow-flow.done", {"seeds": [9, 1]}, r"seeds \[1, 2\], got 120000 of \[9, 1\]"),
+        ("narrow-flow.done", {"steps": 5000}, r"of 120000 steps of .*, got 5000 of \[1, 2\]"),
     ],
 )
-def test_facts_of_something_else_are_noticed(
-    facts: dict[str, Any], message: str, make_up: MakeUp, tmp_path: Path
+def test_files_of_something_else_are_refused(
+    file: str, change: dict[str, Any], message: str, make_up: MakeUp, tmp_path: Path
 ) -> None:
     make_up(NAME, seeds=2)
-    done = tmp_path / NAME / "narrow-flow.done.json"
-    done.write_text(json.dumps({**json.loads(done.read_text()), **facts}))
-    with pytest.raises(ValueError, match=rf"narrow-flow\.done\.json {message}"):
-        Evidence(EXPERIMENTS[NAME], tmp_path / NAME).final("narrow", "flow", "entropy")
-
-
-@pytest.mark.parametrize(
-    ("file", "drop", "message"),
-    [
-        ("settings.json", "steps", r"settings\.json must hold 'steps' \(int\)"),
-        ("narrow-flow.done.json", "steps", r"done\.json must hold 'steps' \(int\)"),
-    ],
-)
-def test_a_missing_field_is_named(
-    file: str,
-    drop: str,
-    message: str,
-    make_up: MakeUp,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    make_up(NAME, seeds=2)
-    path = tmp_path / NAME / file
-    content = json.loads(path.read_text())
-    del content[drop]
-    path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=message):
-        Evidence(EXPERIMENTS[NAME], tmp_path / NAME)
-    assert main(["report", "--results", str(tmp_path)]) == 1
-    assert capsys.readouterr().err.startswith("error: ")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"schema": 99}, "must be of schema 1, got 99"),
-        ({"experiment": "move"}, "named after its experiment, 'move', got 'circle-narrow'"),
-    ],
-)
-def test_settings_of_another_kind_are_refused(
-    change: dict[str, Any], message: str, make_up: MakeUp, tmp_path: Path
-) -> None:
-    make_up(NAME, seeds=2)
-    path = tmp_path / NAME / "settings.json"
+    path = tmp_path / NAME / f"{file}.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(ValueError, match=message):
-        read_settings(path.parent)
+    with pytest.raises(ValueError, match=rf"{file}\.json .*{message}"):
+        Evidence(EXPERIMENTS[NAME], tmp_path / NAME)
 
 
 def test_results_that_are_not_the_experiments_own_are_marked() -> None:
