@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_flowpolicy.common.command_line import assignment, check_folder_of
+from sb3_flowpolicy.common.command_line import assignment, check_folder_of, run
 
 _DESCRIPTION = """\
 Predict, without training, how much an agent gains from noise that correlates between fingers.
@@ -43,7 +43,8 @@ examples:
 each after `python -m sb3_flowpolicy.experiments.`
 
 With the default budget, a family takes about half a minute on one core. The objective is noisy:
-compare searches with other --seed values before you rely on a small difference."""
+compare searches with other --seed values before you rely on a small difference. Needs the extra
+[experiments]."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -71,14 +72,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     check_folder_of(parser, "--json", args.json)
     # Slow imports that --help does not need.
-    try:
-        import pandas as pd
-        from tqdm import tqdm
+    import pandas as pd
+    from tqdm import tqdm
 
-        from sb3_flowpolicy.common.files import write_json
-        from sb3_flowpolicy.experiments.coordination.search import predict, setting_of
-    except ModuleNotFoundError as error:
-        parser.exit(1, f'{error}: pip install "sb3_flowpolicy[experiments]"\n')
+    from sb3_flowpolicy.common.files import write_json
+    from sb3_flowpolicy.experiments.coordination.search import predict, setting_of
 
     names = ("ent_coef", "gamma", "episodes", "budget", "seed")
     options = {name: getattr(args, name) for name in names}
@@ -101,4 +99,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
