@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import pandas as pd
@@ -38,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "width": width,
             "uniform": dims * math.log(2.0),
             "bound": bound(dims, args.survival),
-            **{name: asdict(best(name, dims, width, args.survival)) for name in FAMILIES},
+            **{name: best(name, dims, width, args.survival) for name in FAMILIES},
         }
         for dims, width in WIDTHS.items()
     ]

@@ -15,7 +15,6 @@ with the mean :math:`\bar a` of its coordinates, the width :math:`w` and the rea
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,24 +52,6 @@ _SAMPLES = 20_000
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(200)
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """The best policy of a family at the center of the tunnel.
-
-    Attributes:
-        entropy: Its entropy, nats.
-        progress: Standard deviation of the mean coordinate of an action, the progress along the
-            tunnel as a share of the reach.
-        scale: Standard deviation of each coordinate's own noise before tanh.
-        common: Standard deviation of the noise that all coordinates share, before tanh.
-    """
-
-    entropy: float
-    progress: float
-    scale: float
-    common: float
-
-
 def survival_of(actions: NDArray[np.float64], width: float) -> float:
     """Return the share of actions (N, D) at the center line that stay in the tunnel."""
     offsets = np.linalg.norm(actions - actions.mean(axis=1, keepdims=True), axis=1)
@@ -97,14 +78,20 @@ def bound(dims: int, survival: float) -> float:
     return dims * math.log(2.0) + inside + outside
 
 
-def best(family: str, dims: int, width: float, survival: float) -> Prediction:
-    """Return the policy of a family with the highest entropy.
+def best(family: str, dims: int, width: float, survival: float) -> dict[str, float]:
+    """Find the policy of a family that has the highest entropy at the center of the tunnel.
 
     Args:
         family: Key of ``FAMILIES``.
         dims: Number of coupled dimensions D, at least 2.
         width: Width of the tunnel, world units.
         survival: Probability with which a step survives, in (0, 1).
+
+    Returns:
+        ``entropy`` in nats; ``progress``, the standard deviation of the mean coordinate of an
+        action, which is the progress along the tunnel as a share of the reach; and the standard
+        deviations before tanh of each coordinate's own noise, ``scale``, and of the noise that all
+        coordinates share, ``common``.
     """
     rng = np.random.default_rng(0)
     shared, own = rng.standard_normal((_SAMPLES, 1)), rng.standard_normal((_SAMPLES, dims))
@@ -112,8 +99,10 @@ def best(family: str, dims: int, width: float, survival: float) -> Prediction:
     for common in FAMILIES[family]:
         scale = _widest(common * shared, own, width, survival)
         progress = float(np.tanh(common * shared + scale * own).mean(axis=1).std())
-        candidates.append(Prediction(_entropy(dims, scale, common), progress, scale, float(common)))
-    return max(candidates, key=lambda one: one.entropy)
+        entropy = _entropy(dims, scale, common)
+        found = {"entropy": entropy, "progress": progress, "scale": scale, "common": float(common)}
+        candidates.append(found)
+    return max(candidates, key=lambda found: found["entropy"])
 
 
 def _widest(
