@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,12 +15,18 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.common.vec_env import VecEnv
 from torch.utils._pytree import tree_map_only
 
 from sb3_flowpolicy.algorithms import exploration
-from sb3_flowpolicy.algorithms.exploration import ColoredExploration
+from sb3_flowpolicy.algorithms.exploration import ColoredExploration, episode_length
 from sb3_flowpolicy.checkpoint.rows import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
 from sb3_flowpolicy.checkpoint.state import Run
@@ -43,6 +50,7 @@ from sb3_flowpolicy.guard import NonFiniteError, TrainingGuard
 from sb3_flowpolicy.guard.finite import check_experience, check_observation, check_step
 from sb3_flowpolicy.policies import FlowActor
 from sb3_flowpolicy.policies.base import check_finite
+from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -210,8 +218,9 @@ class EngineFlow(OffPolicyAlgorithm):
         While the model learns with a compiled policy, callbacks such as ``EvalCallback`` act with
         it, too, if they evaluate as many environments at once as the model learns from.
         """
-        is_base = not deterministic or getattr(self.policy, "deterministic_mode", "base") == "base"
-        if is_base and self._runtime.is_running and isinstance(observation, np.ndarray | dict):
+        mode = getattr(self.policy, "deterministic_mode", "base") if deterministic else "base"
+        is_array = isinstance(observation, np.ndarray | dict)
+        if mode == "base" and is_array and self._runtime.is_running:
             engine = self._runtime.engine()
             if engine is not None and engine.compiled:
                 obs, is_batch = self.policy.obs_to_tensor(observation)
@@ -309,12 +318,18 @@ class EngineFlow(OffPolicyAlgorithm):
         return total_timesteps, callback
 
     def _planned_updates(self, total_timesteps: int) -> float:
-        """Count the updates still to come; an estimate where episodes decide."""
+        """Count the updates still to come.
+
+        Where episodes decide, it counts those of full length: none if they have no time limit.
+        """
         steps = max(0, total_timesteps - max(self.num_timesteps, self.learning_starts))
         if self.gradient_steps < 0:
             return steps
         assert isinstance(self.train_freq, TrainFreq)
-        return steps / self.env.num_envs * self.gradient_steps / self.train_freq.frequency
+        between: float = self.train_freq.frequency
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+            between *= episode_length(self.env) or math.inf
+        return steps / self.env.num_envs * self.gradient_steps / between
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any
@@ -376,6 +391,12 @@ class EngineFlow(OffPolicyAlgorithm):
         The engine's views would bring the whole memory that they look at into a saved file.
         """
         return tree_map_only(th.Tensor, lambda one: one.detach().clone(), super().get_parameters())
+
+    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
+        """Save as SB3 does, with a ``deterministic_mode`` that was set after construction."""
+        if isinstance(self.policy, DistributionPolicy):
+            self.policy_kwargs = self.policy.up_to_date(self.policy_kwargs)
+        super().save(path, exclude, include)
 
     def _describe_run(self) -> Run:
         return Run(

@@ -161,7 +161,7 @@ class ColoredExploration:
                 "action_noise_color must be 0 unless the policy is one of sb3_flowpolicy's with "
                 f"use_sde=False, got {color} with {type(actor).__name__}"
             )
-        horizon = _episode_length(env)
+        horizon = episode_length(env)
         new = NoiseProcess(actor.density.noise_dim, n_envs, color, correlation_time, horizon)
         if self.process is None or self.process.settings != new.settings:
             self.process = new
@@ -186,7 +186,7 @@ class ColoredExploration:
             self.process.load_state(state)
 
 
-def _episode_length(env: Any) -> int | None:
+def episode_length(env: Any) -> int | None:
     """Return the time limit of episodes in steps, None without one."""
     steps = None
     if not isinstance(env, VecEnv):

@@ -26,7 +26,6 @@ from sb3_flowpolicy.bundle import load_bundle, save_bundle
 from sb3_flowpolicy.common.validation import check_settings, integer, number, optional
 from sb3_flowpolicy.engine.sac import SB3_CRITIC_LOSS_COEF, SACObjective
 from sb3_flowpolicy.policies import sac
-from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -56,7 +55,8 @@ class SACFlow(EngineFlow, SAC):
             weight decay, which weighs half as much at 1.0.
         compile: Whether to compile the update: several times faster after 10 to 30 seconds of
             warm-up. ``"auto"`` compiles once calls of :meth:`learn` have planned enough updates to
-            repay it. Compiled or not, the numbers are the same.
+            repay it. Compiled or not, the numbers are
+            the same up to rounding.
         autocast: Whether matrix products run in bfloat16 (``torch.autocast``). On processors that
             support it, networks of 128 units or more train 1.2 to 1.6 times as fast, small ones
             slower. Parameters, optimizer states and replay stay float32; products keep 8 bits.
@@ -209,12 +209,6 @@ class SACFlow(EngineFlow, SAC):
         finally:
             hook.remove()
         self.logger.name_to_value["train/critic_loss"] *= factor
-
-    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        """Save as SB3 does, with a ``deterministic_mode`` that was set after construction."""
-        if isinstance(self.policy, DistributionPolicy):
-            self.policy_kwargs = self.policy.up_to_date(self.policy_kwargs)
-        super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_demonstrations"]

@@ -1,1 +1,1 @@
-"""Shared by several packages: argument checks, files, vectorized environments."""
+"""Shared by several packages: argument checks, files, statistics, command lines, environments."""

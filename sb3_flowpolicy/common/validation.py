@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-#: Turns a value into plain Python, or raises ``ValueError`` with the name it is given.
+#: Returns the value, numbers as Python's own, or raises ``ValueError`` with the name it is given.
 Check = Callable[[str, Any], Any]
 
 # The largest integer up to which JSON numbers are exact.
@@ -143,7 +143,7 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
-# Arguments of every algorithm that are not plain values.
+# Further arguments of every algorithm.
 _FURTHER: dict[str, Check] = {
     "policy_kwargs": optional(mapping),
     "replay_buffer_kwargs": optional(mapping),

@@ -76,7 +76,7 @@ class ActionDistribution(nn.Module, ABC):
         return self._log_prob(context, value)
 
     def mode(self, context: th.Tensor) -> th.Tensor:
-        """Return the mean, or for a flow the image of the base mean, shape (..., D)."""
+        """Return the sample of zero noise, shape (..., D): for a Gaussian the mean."""
         _check_last_dim("context", context, self.context_dim)
         return self._mode(context)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
@@ -21,6 +20,7 @@ from sb3_flowpolicy.engine.ppo_update import (
     policy_function,
 )
 from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
+from sb3_flowpolicy.guard.finite import NonFiniteError
 from sb3_flowpolicy.policies.base import check_finite
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic
 
@@ -111,7 +111,7 @@ class PPOEngine(BoundEngine):
             are those of the last epoch, as in SB3.
 
         Raises:
-            ValueError: If a log-probability is not finite: that minibatch changed nothing.
+            NonFiniteError: If a log-probability is not finite: that minibatch changed nothing.
         """
         model, target_kl = self.model, self.settings.target_kl
         rate = self.policy.optimizer.param_groups[0]["lr"]
@@ -132,9 +132,12 @@ class PPOEngine(BoundEngine):
                     kl = float(found[-1][3])
                     print(f"Early stopping at step {epoch} due to reaching max kl: {kl:.2f}")
                 break
-        columns = th.stack(found).T.cpu()
-        check_finite(np.where(columns[-1], 0.0, np.nan), "log-probabilities")
-        losses = dict(zip(PPO_LOSSES, columns.tolist(), strict=False))
+        *columns, finite = th.stack(found).T.tolist()
+        if not all(finite):
+            raise NonFiniteError(
+                "observation and weights must be finite, got log-probabilities with NaN or infinity"
+            )
+        losses = dict(zip(PPO_LOSSES, columns, strict=True))
         losses["approx_kl"] = losses["approx_kl"][start_of_epoch:]
         return losses
 

@@ -21,7 +21,7 @@ class TrainState(NamedTuple):
 
     actor: th.Tensor
     critic: th.Tensor
-    others: tuple[th.Tensor, ...]  # the target networks, see StackedNetworks
+    others: tuple[th.Tensor, ...]  # the target networks; for CrossQ running statistics
     ent_coef: th.Tensor  # (S, 1): its logarithm if it is learned
     actor_moments: Moments
     critic_moments: Moments
@@ -94,16 +94,16 @@ def step_entropy_coefficient(
     if settings.ent_coef_adam is None or moments is None:
         return th.zeros_like(state.ent_coef)
     # The gradient of -log(alpha) * mean(log pi + target) is that mean itself, negated.
-    surplus = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
-    loss = -(state.ent_coef * surplus)
-    step(state.ent_coef, -surplus, moments, learning_rate, settings.ent_coef_adam)
+    missing = (log_prob.detach() + settings.target_entropy).mean(-1, keepdim=True)
+    loss = -(state.ent_coef * missing)
+    step(state.ent_coef, -missing, moments, learning_rate, settings.ent_coef_adam)
     return loss
 
 
-def bellman_targets(batch: Batch, next_values: th.Tensor, entropy: th.Tensor) -> th.Tensor:
-    """Return r + gamma (1 - d) (V' - entropy), (S, B, T), for values (S, B, T)."""
+def bellman_targets(batch: Batch, next_values: th.Tensor, penalty: th.Tensor) -> th.Tensor:
+    """Return r + gamma (1 - d) (V' - penalty), (S, B, T), for V' (S, B, T) and penalties (S, B)."""
     discounts = (1 - batch.dones) * batch.discounts
-    next_values = next_values - entropy.unsqueeze(-1)
+    next_values = next_values - penalty.unsqueeze(-1)
     return batch.rewards.unsqueeze(-1) + discounts.unsqueeze(-1) * next_values
 
 

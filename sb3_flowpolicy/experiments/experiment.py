@@ -19,7 +19,8 @@ class Agent:
     Attributes:
         name: Name in commands and file names.
         label: Name in figures.
-        algo: File of ``zoo_hyperparams`` that holds its hyperparameters.
+        algo: ``sac_gauss``, ``sac_lowrank``, or ``sac_flow``: the file of ``zoo_hyperparams`` with
+            its hyperparameters.
         color: Its color in all figures. The colors of the thesis's agents remain distinct in print
             and for color-blind readers (Okabe and Ito).
         overrides: What differs from that file, merged into nested mappings.

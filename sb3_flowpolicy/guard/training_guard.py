@@ -66,13 +66,14 @@ class TrainingGuard:
         found = []
         for index, model in enumerate(self.models):
             kept = {name: one.clone() for name, one in _training_tensors(model).items()}
+            found.append(kept)
             # A sum takes less time than looking at every number.
-            suspicious = not math.isfinite(sum(float(one.sum()) for one in kept.values()))
-            for name, values in kept.items() if suspicious else ():
+            if math.isfinite(sum(float(one.sum()) for one in kept.values())):
+                continue
+            for name, values in kept.items():
                 if not values.isfinite().all():
                     value = values[~values.isfinite()][0].item()
                     self._stop(name, value, index, f"after {model._n_updates} updates")
-            found.append(kept)
         return found
 
     def before_updates(self) -> None:
@@ -114,7 +115,8 @@ class TrainingGuard:
             row, index = np.argwhere(~np.isfinite(losses))[0].tolist()
             value, buffer = losses[row][index], self.models[index].replay_buffer
             when = "in the last updates; replay buffer"
-            columns = {column: getattr(buffer, column) for column in _COLUMNS}
+            # With optimize_memory_usage there is one column of observations.
+            columns = {name: vars(buffer)[name] for name in _COLUMNS if name in vars(buffer)}
         ranges = [
             f"{column} {_range(values)}"
             for column, values in columns.items()

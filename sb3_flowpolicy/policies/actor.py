@@ -174,7 +174,7 @@ class FlowActor(Actor):
             Correlation matrices, shape (batch, D, D), entries in [-1, 1].
         """
         context = self.context(obs)
-        noise = self.density.draw_noise(context, n_samples)
+        noise = self.density.draw_noise(context, integer(2)("n_samples", n_samples))
         actions = self.density.rsample(context, noise).movedim(0, -1)
         centered = actions - actions.mean(-1, keepdim=True)
         # A constant dimension has correlation 0 with all others and 1 with itself.

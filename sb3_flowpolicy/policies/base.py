@@ -15,6 +15,7 @@ from stable_baselines3.common.torch_layers import (
     FlattenExtractor,
     NatureCNN,
 )
+from torch import nn
 
 from sb3_flowpolicy.common.validation import layer_sizes, mapping, optional
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite, check_observation
@@ -65,9 +66,16 @@ class DensityPolicy(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch batch normalization and dropout; ``predict`` does so at every step."""
-        # Walking through all modules each time would take longer than a small network does.
-        if self.training != mode or any(part.training != mode for part in self.children()):
-            super().set_training_mode(mode)
+        # Setting the mode of all modules each time would take longer than a small network does.
+        modules: list[nn.Module | None] = [self]
+        while modules:
+            module = modules.pop()
+            if module is None:
+                continue
+            if module.training != mode:
+                super().set_training_mode(mode)
+                return
+            modules += module._modules.values()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {

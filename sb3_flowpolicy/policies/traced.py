@@ -22,7 +22,7 @@ class TracedCalls:
     A flow consists of some sixty small operations. For one observation, calling them from Python
     takes several times as long as the arithmetic. ``torch.jit.trace`` records the operations, so
     the results are the same. A graph shares the parameters of the modules: it follows optimizers
-    and ``load_state_dict``. It does not notice modules that are replaced, or hooks.
+    and ``load_state_dict``. It does not notice hooks, or parts of the modules that are replaced.
 
     A function that branches on the values of tensors runs as it is, and so does every function
     where torch has no ``torch.jit.trace``, which it calls deprecated.
@@ -46,7 +46,7 @@ class TracedCalls:
         are all in training mode or all not.
         """
         shapes = [(tensor.shape, tensor.dtype, tensor.device) for tensor in tensors]
-        key = (function, modules[0].training, *shapes)
+        key = (function, modules, modules[0].training, *shapes)
         graph = self._graphs.get(key)
         if graph is not None:
             with th.inference_mode():  # saves an eighth of the time

@@ -1,4 +1,4 @@
-"""An off-policy algorithm of SB3's kind gets everything ours have from one small class.
+"""An off-policy algorithm with SB3's own update gets what ours have from one small class.
 
 In the package these are at most four files of code: one in ``algorithms/``, one in ``policies/``
 unless SAC's will do, and entries in ``sb3_flowpolicy/__init__.py`` and ``zoo/registration.py``. A

@@ -55,6 +55,14 @@ def test_color_changes_exploration_and_is_saved(algorithm: Any, tmp_path: Path) 
 
 
 @OFF_POLICY
+def test_a_deterministic_mode_that_is_set_later_is_saved(algorithm: Any, tmp_path: Path) -> None:
+    model = make(algorithm)
+    model.policy.deterministic_mode = "q"
+    model.save(tmp_path / "model")
+    assert algorithm.load(tmp_path / "model").policy.deterministic_mode == "q"
+
+
+@OFF_POLICY
 def test_values_in_the_diagnostics_are_the_critics(algorithm: Any) -> None:
     model = make(algorithm)
     model.learn(60, PolicyDiagnosticsCallback(log_freq=60, image_freq=0))

@@ -241,3 +241,9 @@ def test_auto_compiles_once_all_calls_of_learn_together_repay_it(
     assert not any(asked)
     resumed.learn(30, reset_num_timesteps=False, **settings)
     assert asked[-1]
+
+
+@pytest.mark.parametrize(("every", "planned"), [((2, "episode"), 5), (4, 500)])
+def test_updates_are_planned_by_episodes_of_full_length(every: Any, planned: int) -> None:
+    model = SACFlow("GaussPolicy", "Pendulum-v1", train_freq=every, learning_starts=0)
+    assert model._planned_updates(2000) == planned

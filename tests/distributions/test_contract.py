@@ -9,6 +9,7 @@ import torch as th
 from torch.func import functional_call, stack_module_state, vmap
 
 from sb3_flowpolicy.distributions import ActionDistribution, TanhSquashed, registered_distributions
+from sb3_flowpolicy.distributions.gaussian import DiagGaussian
 from tests.distributions.conftest import CONTEXT_DIM, build
 
 
@@ -20,7 +21,7 @@ def draw(density: ActionDistribution, *shape: int, seed: int = 2) -> th.Tensor:
 def log_density_by_jacobian(
     density: ActionDistribution, context: th.Tensor, noise: th.Tensor
 ) -> th.Tensor:
-    """Change of variables; where M > D the map is affine up to tanh, and u is normal."""
+    """Change of variables; a Gaussian with M > D is an affine map of its noise."""
 
     def sample(noise: th.Tensor) -> th.Tensor:
         return density.rsample_and_log_prob(context, noise)[0]
@@ -56,6 +57,8 @@ def test_density_integrates_to_one(name: str, dim: int, squashed: bool, context:
 def test_log_prob_is_the_change_of_variables(
     density: ActionDistribution, context: th.Tensor
 ) -> None:
+    if density.noise_dim > density.action_dim and not isinstance(density, DiagGaussian):
+        pytest.skip("not a change of variables; that the density integrates to 1 is tested above")
     for noise in draw(density, 5):
         _, log_prob = density.rsample_and_log_prob(context, noise)
         expected = log_density_by_jacobian(density, context, noise)

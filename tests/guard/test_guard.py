@@ -204,6 +204,16 @@ def test_training_stops_and_goes_back(
     model.predict(np.zeros(3, np.float32))
 
 
+@pytest.mark.filterwarnings("ignore:training runs the stock loop")
+def test_a_buffer_without_next_observations_is_described() -> None:
+    kwargs = {"net_arch": [16, 16], "optimizer_class": th.optim.SGD}
+    options = {"handle_timeout_termination": False}
+    model = trained(policy_kwargs=kwargs, optimize_memory_usage=True, replay_buffer_kwargs=options)
+    spoil(model, "rewards", slice(None), np.nan)  # type: ignore[arg-type]
+    with pytest.raises(NonFiniteError, match=r"critic_loss must be finite.*rewards"):
+        model.train(3, batch_size=16)
+
+
 def test_crossq_goes_back_with_its_running_statistics() -> None:
     """Their counts of steps are integers."""
     model = CrossQFlow("GaussPolicy", "Pendulum-v1", compile=False, **SEEDED).learn(60)

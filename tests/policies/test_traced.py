@@ -78,6 +78,17 @@ def test_graphs_give_the_same_actions_and_follow_the_weights(
     np.testing.assert_array_equal(actions(model, deterministic), eagerly(model, deterministic))
 
 
+def test_a_network_that_is_replaced_acts_in_its_own_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(traced, "CALLS_WORTH_TRACING", 2)
+    model = make(SACFlow, "gaussian")
+    before = actions(model, True)
+    model.actor.latent_pi = nn.Sequential(nn.Linear(4, 16), nn.Dropout())
+    after = actions(model, True)
+    assert not np.array_equal(before, after)
+    assert not any(module.training for module in model.actor.modules())
+    np.testing.assert_array_equal(actions(model, True), after)
+
+
 def test_copies_have_their_own_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(traced, "CALLS_WORTH_TRACING", 2)
     model = make(SACFlow, "realnvp")
