@@ -71,6 +71,9 @@ def follow_recipe(
         n_steps: Number of transitions.
         controller_kwargs: Arguments of that class or function.
 
+    Raises:
+        ValueError: If the environments were not made from an id.
+
     Example:
         >>> import flowpolicy_envs
         >>> from stable_baselines3.common.env_util import make_vec_env
@@ -129,7 +132,14 @@ def fill_replay_buffer(
     """Append demonstrations, as of :func:`load_demonstrations`, to a replay buffer.
 
     With several environments each gets a run of consecutive rows, and up to n_envs - 1 rows at
-    the end are left out. Returns the number of transitions that were added.
+    the end are left out.
+
+    Returns:
+        Number of transitions that were added.
+
+    Raises:
+        ValueError: If the buffer cannot take them, there are too many or too few, they do not fit
+            the spaces, or actions leave theirs.
     """
     if buffer is None or isinstance(buffer, DictReplayBuffer) or buffer.optimize_memory_usage:
         raise ValueError(

@@ -175,12 +175,12 @@ class EngineFlow(OffPolicyAlgorithm):
         """Train as in SB3, and optionally write checkpoints to resume from.
 
         Args:
-            total_timesteps: As in SB3, as are the following.
-            callback: As in SB3.
-            log_interval: As in SB3.
-            tb_log_name: As in SB3. Default: the stock algorithm's name.
-            reset_num_timesteps: As in SB3.
-            progress_bar: As in SB3.
+            total_timesteps: Environment steps, in sum over environments.
+            callback: Callback, list of callbacks, or function, as for SB3.
+            log_interval: Episodes between two dumps of the log.
+            tb_log_name: Name of the TensorBoard run. Default: the stock algorithm's name.
+            reset_num_timesteps: Whether to count from zero, or to continue.
+            progress_bar: Whether to show one.
             checkpoint_every: Environment steps between two checkpoints for :meth:`resume`. Ctrl-C
                 and SIGTERM then write one, too, before they stop the program. Default: none.
             checkpoint_path: Folder for them, empty for a new run.

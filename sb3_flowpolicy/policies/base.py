@@ -99,7 +99,12 @@ def check_action_space(space: spaces.Space, bounded: bool = True) -> None:
 
 
 def check_net_arch(net_arch: Any, required: set[str], allowed: set[str]) -> None:
-    """Check the units per layer: None, a list, or a mapping with one for actor and critic each."""
+    """Check the units per layer: None, a list, or a mapping with one for actor and critic each.
+
+    Raises:
+        ValueError: If a mapping lacks a ``required`` key or has one that is not ``allowed``, or a
+            size is not an integer of at least 1.
+    """
     if isinstance(net_arch, Mapping):
         if not required <= set(net_arch) <= allowed:
             raise ValueError(
