@@ -59,12 +59,15 @@ def renormalize(
     return x, {name: value.squeeze(-2) for name, value in new.items()}
 
 
+# The entries ``others`` of the state: running statistics, and by how many steps they were updated.
+_ACTOR, _CRITICS, _STEPS_OF_ACTOR, _STEPS_OF_CRITICS = range(4)
+
+
 class RenormNetworks(StackedNetworks):
     """Networks of CrossQ: instead of target networks they have running statistics.
 
-    Those are the entries ``others`` of the state: of the actor and of the critics, and how many
-    steps each have been updated. With ``training``, functions use the statistics of the batch, and
-    also return new running ones by name.
+    With ``training``, functions use the statistics of the batch, and also return new running ones
+    by name.
     """
 
     def _others(self, policies: Sequence[Any]) -> list[FlatParameters]:
@@ -95,11 +98,11 @@ class RenormNetworks(StackedNetworks):
         training: bool,
     ) -> tuple[th.Tensor, th.Tensor, Tensors]:
         """Sample actions (S, B, D) and their log-probabilities (S, B)."""
-        parameters, statistics = self.actor.unflatten(actor), self.others[0].unflatten(others[0])
+        parameters, statistics = self.actor.unflatten(actor), self._statistics(others, _ACTOR)
         one = partial(self._sample_one_seed, training=training)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
             actions, log_prob, new = per_seed(
-                one, parameters, statistics, others[2][:, :1], obs, noise
+                one, parameters, statistics, others[_STEPS_OF_ACTOR][:, :1], obs, noise
             )
         return actions.to(actor.dtype), log_prob.to(actor.dtype), new
 
@@ -138,7 +141,8 @@ class RenormNetworks(StackedNetworks):
         training: bool,
     ) -> tuple[th.Tensor, Tensors]:
         """Evaluate all critics of all seeds, (S, C, B, 1)."""
-        statistics, steps = self.others[1].unflatten(others[1]), others[3][:, :1, None]
+        statistics = self._statistics(others, _CRITICS)
+        steps = others[_STEPS_OF_CRITICS][:, :1, None]
         new: Tensors = {}
 
         def normalize(name: str, layer: Any, weights: Tensors, hidden: th.Tensor) -> th.Tensor:
@@ -153,10 +157,13 @@ class RenormNetworks(StackedNetworks):
 
     def write_statistics(self, others: Sequence[th.Tensor], new: Tensors, of_critics: bool) -> None:
         """Overwrite the running statistics of the actor or the critics, and count the step."""
-        olds = self.others[of_critics].unflatten(others[of_critics])
+        olds = self._statistics(others, _CRITICS if of_critics else _ACTOR)
         for name, value in new.items():
             olds[name].copy_(value)
-        others[2 + of_critics].add_(1)
+        others[_STEPS_OF_CRITICS if of_critics else _STEPS_OF_ACTOR].add_(1)
+
+    def _statistics(self, others: Sequence[th.Tensor], which: int) -> Tensors:
+        return self.others[which].unflatten(others[which])
 
 
 def _buffers(networks: Sequence[Sequence[nn.Module]], counts: bool, copies: bool) -> FlatParameters:
