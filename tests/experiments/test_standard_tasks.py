@@ -14,6 +14,8 @@ from torch import nn
 from sb3_flowpolicy.experiments.standard_tasks import __main__ as command
 from sb3_flowpolicy.experiments.standard_tasks import rule, tasks, training
 
+OTHERS = ("gauss", "lowrank", "full", "lowrank_squashed", "flow_squashed")
+
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,7 +47,7 @@ def test_runs_are_recorded_and_not_repeated(
     monkeypatch.setattr(training, "train", lambda *run: trained.append(run[1:4]) or train(*run))
     figure = tmp_path / "curves.png"
     command.main([*options, "--algorithms", "ppo", "--figure", str(figure)])
-    assert trained == [("ppo", name, 3) for name in ("gauss", "lowrank", "full")]
+    assert trained == [("ppo", name, 3) for name in OTHERS]
     assert figure.stat().st_size > 10_000
 
 

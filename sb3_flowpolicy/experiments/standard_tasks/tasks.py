@@ -69,6 +69,8 @@ def _candidates(stock: Any, ours: Any, **more: Candidate) -> dict[str, Candidate
     }
 
 
+_SQUASHED = {"squash_output": True, "state_dependent_std": True}
+
 CANDIDATES: dict[str, dict[str, Candidate]] = {
     "sac": _candidates(
         SAC, SACFlow, spline=Candidate(SACFlow, "FlowPolicy", {"distribution": "spline"})
@@ -79,9 +81,12 @@ CANDIDATES: dict[str, dict[str, Candidate]] = {
         PPO,
         PPOFlow,
         full=Candidate(PPOFlow, "GaussPolicy", {"distribution": "full_covariance"}),
+        lowrank_squashed=Candidate(PPOFlow, "LowRankPolicy", _SQUASHED),
+        flow_squashed=Candidate(PPOFlow, "FlowPolicy", _SQUASHED),
     ),
 }
-"""Algorithm -> name -> candidate; "stock" is the algorithm with its own policy."""
+"""Algorithm -> name -> candidate; "stock" is the algorithm with its own policy. "squashed" policies
+bound actions by tanh, and their standard deviation depends on the observation."""
 
 _STEPS = {"sac": 300_000, "tqc": 100_000, "crossq": 100_000, "ppo": 500_000}
 
@@ -103,7 +108,7 @@ TASKS: dict[str, Task] = {
                 "gamma": 0.8,
                 "gae_lambda": 0.9,
                 "learning_rate": 1e-3,
-                "ent_coef": 0.01,
+                "ent_coef": 0.05,
                 "policy_kwargs": {"net_arch": [32, 32]},
             },
         },
