@@ -15,7 +15,6 @@ from stable_baselines3.common.torch_layers import (
     FlattenExtractor,
     NatureCNN,
 )
-from torch import nn
 
 from sb3_flowpolicy.common.validation import layer_sizes, mapping, optional
 from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite, check_observation
@@ -66,16 +65,11 @@ class DensityPolicy(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch batch normalization and dropout; ``predict`` does so at every step."""
-        # Setting the mode of all modules each time would take longer than a small network does.
-        modules: list[nn.Module | None] = [self]
-        while modules:
-            module = modules.pop()
-            if module is None:
-                continue
-            if module.training != mode:
-                super().set_training_mode(mode)
-                return
-            modules += module._modules.values()
+        # Walking through all modules each time would take longer than a small network does. Two
+        # levels hold the networks, of which one may have been replaced.
+        parts = [*self.children(), *(part for one in self.children() for part in one.children())]
+        if self.training != mode or any(part.training != mode for part in parts):
+            super().set_training_mode(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
