@@ -139,9 +139,9 @@ class Evidence:
         curves = self.curves(setting, agent, metric)
         return curves.tail(max(FINAL_LEAST, round(FINAL_SHARE * len(curves)))).mean().to_numpy()
 
-    def solved(self, setting: str, agent: str) -> np.ndarray:
+    def solved(self, setting: str, agent: str, metric: str = "test_success") -> np.ndarray:
         """Return which seeds succeed at the end, (S,)."""
-        return self.final(setting, agent, "test_success") >= SOLVED - _ROUNDING
+        return self.final(setting, agent, metric) >= SOLVED - _ROUNDING
 
     def _solved_at(self, setting: str, agent: str) -> pd.DataFrame:
         """Return whether the last evaluations in a row succeed, by step and seed."""

@@ -29,7 +29,10 @@ SMOOTHED_OVER = 3
 
 
 def panels(evidence: Evidence) -> list[str]:
-    """Return the metrics to draw: those measured, and the entropy coefficient if learned."""
+    """Return the metrics to draw: the entropy coefficient only if learned.
+
+    The second deterministic action is left to the tables.
+    """
     measured = {(s.name, a.name): evidence.columns(s.name, a.name) for s, a in evidence.measured}
     names = {name for columns in measured.values() for name in columns}
     if not any(
@@ -38,7 +41,7 @@ def panels(evidence: Evidence) -> list[str]:
         if "ent_coef" in columns
     ):
         names.discard("ent_coef")
-    return [name for name in WORDS if name in names]
+    return [name for name in WORDS if name in names and not name.startswith("log_prob")]
 
 
 def curves_figure(evidence: Evidence) -> Figure:

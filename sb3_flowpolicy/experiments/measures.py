@@ -66,6 +66,20 @@ def _buffer_states(model: SACFlow, seed: int) -> th.Tensor:
     return th.as_tensor(buffer.observations[rows, 0])
 
 
+@contextmanager
+def _acting_with(models: Sequence[EngineFlow], mode: str) -> Iterator[None]:
+    """Set the deterministic mode for a while."""
+    policies: list[Any] = [model.policy for model in models]
+    before = [policy.deterministic_mode for policy in policies]
+    for policy in policies:
+        policy.deterministic_mode = mode
+    try:
+        yield
+    finally:
+        for policy, usual in zip(policies, before, strict=True):
+            policy.deterministic_mode = usual
+
+
 TRAINING_INFOS = ("x_std", "x_max")
 """Means over the training episodes since the last measurement (thesis Fig. 3.18)."""
 
@@ -80,11 +94,26 @@ class DeterministicEpisodes:
         self.starts = [10**6 * (seed + 1) + k for seed in seeds for k in range(n_episodes)]
         self.venv: VectorEnv = make_vec_env(env, len(self.starts))
 
-    def run(self, models: Sequence[EngineFlow]) -> list[tuple[float, float | None]]:
+    def run(
+        self, models: Sequence[EngineFlow], mode: str = "base"
+    ) -> list[tuple[float | None, float | None]]:
         """Return mean return and success rate of each policy, one per seed.
 
-        The success rate is None if the environment does not report success.
+        ``mode`` is the ``deterministic_mode`` to act with. The success rate is None if the
+        environment does not report success, and both are if the actor has no such mode (gSDE).
         """
+        if mode != "base" and not isinstance(models[0].actor, FlowActor):
+            return [(None, None)] * len(models)
+        with _acting_with(models, mode):
+            returns, success = self._run(models)
+        means, rates = (values.reshape(len(models), -1).mean(1) for values in (returns, success))
+        return [
+            (float(mean), None if np.isnan(rate) else float(rate))
+            for mean, rate in zip(means, rates, strict=True)
+        ]
+
+    def _run(self, models: Sequence[EngineFlow]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the return of each episode, and 1.0, 0.0, or NaN for its success."""
         obs, _ = self.venv.reset(seed=self.starts)  # type: ignore[arg-type]
         count = len(self.starts)
         returns, running = np.zeros(count), np.ones(count, dtype=bool)
@@ -101,11 +130,7 @@ class DeterministicEpisodes:
             if reported is not None:
                 success[ended] = np.asarray(reported)[ended]
             running &= ~ended
-        means, rates = (values.reshape(len(models), -1).mean(1) for values in (returns, success))
-        return [
-            (float(mean), None if np.isnan(rate) else float(rate))
-            for mean, rate in zip(means, rates, strict=True)
-        ]
+        return returns, success
 
     def close(self) -> None:
         """Close the environments."""

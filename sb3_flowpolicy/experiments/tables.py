@@ -13,6 +13,8 @@ WORDS = {
     "train_success": "training success",
     "test_return": "test return",
     "test_success": "test success",
+    "log_prob_return": "test return, most likely action",
+    "log_prob_success": "test success, most likely action",
     "entropy": "entropy",
     "ent_coef": "entropy coefficient",
     "same_axis_correlation": "correlation of same-axis actions",
@@ -47,6 +49,9 @@ def results_table(evidence: Evidence) -> pd.DataFrame:
             steps = interquartile_mean(evidence.steps_until_solved(*pair))
             row["solved at the end"] = f"{solved.sum()} of {len(solved)}"
             row["at its best"] = f"{once.sum()} of {len(once)}"
+            if "log_prob_success" in metrics:
+                likely = evidence.solved(*pair, "log_prob_success")
+                row["by the most likely action"] = f"{likely.sum()} of {len(likely)}"
             row["steps until solved"] = f"{steps:,.0f}" if once.any() else "never"
         for name, final in finals.items():
             row["seeds"] = str(len(final))

@@ -130,8 +130,8 @@ class _Training:
                 )
                 first = False
             done = models[0].num_timesteps
-            tested = tests.run(models)
-            self.files.append_rows([self._row(*one) for one in zip(models, tested, strict=True)])
+            tested = zip(models, tests.run(models), tests.run(models, "log_prob"), strict=True)
+            self.files.append_rows([self._row(*one) for one in tested])
             if group == 0 and any(stage < at <= done for at in item.pictures_at):
                 self._record("picture", measures.policy_picture, models[:1])
             stage = done
@@ -188,7 +188,12 @@ class _Training:
     def _tell(self, group: int, steps: int) -> None:
         self.report(self.item.key, (group * self.item.steps + steps) // len(self.groups))
 
-    def _row(self, model: Any, tested: tuple[float, float | None]) -> dict[str, float | None]:
+    def _row(
+        self,
+        model: Any,
+        tested: tuple[float | None, float | None],
+        most_likely: tuple[float | None, float | None],
+    ) -> dict[str, float | None]:
         """Measure one agent, and forget the episodes that the row accounts for."""
         episodes, success, seed = model.ep_info_buffer, model.ep_success_buffer, model.seed
         row = {
@@ -199,6 +204,8 @@ class _Training:
             "train_success": _mean(list(success)),
             "test_return": tested[0],
             "test_success": tested[1],
+            "log_prob_return": most_likely[0],
+            "log_prob_success": most_likely[1],
             "entropy": measures.policy_entropy(model, seed),
             "ent_coef": _ent_coef(model),
         }

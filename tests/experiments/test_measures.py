@@ -30,3 +30,27 @@ def test_the_profile_follows_the_way_that_is_rewarded(
     length = geometry.locate(geometry.point(0.0))[1]
     expected = length * (1 - np.arange(measures.PROFILE_POINTS) / measures.PROFILE_POINTS)
     np.testing.assert_allclose(remaining, expected, atol=1e-6)
+
+
+def test_episodes_use_the_mode_and_leave_the_policy_as_it_was() -> None:
+    model = SACFlow(
+        "FlowPolicy",
+        "TunnelHorizontal-v0",
+        policy_kwargs={"net_arch": [4], "deterministic_mode": "q"},
+        device="cpu",
+    )
+    used = set()
+    predict = model.policy.predict
+    model.policy.predict = lambda *given, **more: (  # type: ignore[method-assign]
+        used.add(model.policy.deterministic_mode) or predict(*given, **more)  # type: ignore[func-returns-value]
+    )
+    tests = measures.DeterministicEpisodes("TunnelHorizontal-v0", [1], 2)
+    tests.run([model], "log_prob")
+    assert used == {"log_prob"}
+    assert model.policy.deterministic_mode == "q"
+
+
+def test_gsde_has_no_most_likely_action() -> None:
+    model = SACFlow("GaussPolicy", "TunnelHorizontal-v0", use_sde=True, device="cpu")
+    tests = measures.DeterministicEpisodes("TunnelHorizontal-v0", [1], 2)
+    assert tests.run([model], "log_prob") == [(None, None)]

@@ -22,6 +22,7 @@ from sb3_flowpolicy.experiments.figures import outcomes_figure
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 from sb3_flowpolicy.experiments.report import Section, read_results, write_docs, write_report
 from sb3_flowpolicy.experiments.store import ItemFiles
+from sb3_flowpolicy.experiments.tables import results_table
 from tests.experiments.conftest import MakeUp, declare_whole
 
 
@@ -96,6 +97,18 @@ def test_a_seed_that_fails_is_counted(make_up: MakeUp, tmp_path: Path) -> None:
     _, findings = found.judge()
     assert findings[-1].holds is False
     assert findings[-1].measured == "9 of 10"
+
+
+def test_the_table_counts_both_deterministic_actions(make_up: MakeUp, tmp_path: Path) -> None:
+    make_up("circle-fixed-alpha")
+    files = ItemFiles(tmp_path / "circle-fixed-alpha", "circle-flow")
+    table = files.read_table().assign(log_prob_return=1.0, log_prob_success=1.0)
+    table.loc[table["seed"] == 3, "log_prob_success"] = 0.0
+    table.to_csv(files.table, index=False)
+    declare_whole(files)
+    counts = results_table(evidence("circle-fixed-alpha", tmp_path)).set_index("agent")
+    column = counts["by the most likely action"]
+    assert (column["NF"], column["Gauss"]) == ("9 of 10", "-")
 
 
 def test_oscillations_are_what_all_three_curves_do(make_up: MakeUp, tmp_path: Path) -> None:
