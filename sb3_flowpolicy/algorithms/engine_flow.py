@@ -221,7 +221,7 @@ class EngineFlow(OffPolicyAlgorithm):
         mode = getattr(self.policy, "deterministic_mode", "base") if deterministic else "base"
         is_array = isinstance(observation, np.ndarray | dict)
         if mode == "base" and is_array and self._runtime.is_running:
-            engine = self._runtime.engine()
+            engine = self._runtime.acting_engine()
             if engine is not None and engine.compiled:
                 obs, is_batch = self.policy.obs_to_tensor(observation)
                 check_observation(observation)
@@ -345,7 +345,7 @@ class EngineFlow(OffPolicyAlgorithm):
         random_steps = learning_starts if self.random_steps is None else self.random_steps
         engine = noise = None
         if self.num_timesteps >= random_steps:
-            engine = self._runtime.engine() if self._runtime.is_running else None
+            engine = self._runtime.acting_engine() if self._runtime.is_running else None
             noise = self._exploration.next()
         if engine is not None and engine.compiled:
             obs = engine.networks.observations.pack(self._last_obs, self.device)

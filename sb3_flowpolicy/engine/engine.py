@@ -114,6 +114,11 @@ class Engine(BoundEngine):
         eager = self._compiled_update.eager or self._compiled_sample.eager
         return self.compiled and not eager
 
+    def acts_as_now(self) -> bool:
+        """Whether the actor and its statistics are still bound."""
+        parts = (self.networks.actor, *self.networks.others)
+        return self._has_same_things() and all(part.is_bound() for part in parts)
+
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
         """Sample scaled actions in [-1, 1], (S, N, D), for observations (S, N, ...).

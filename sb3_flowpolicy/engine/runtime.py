@@ -66,6 +66,10 @@ class BoundEngine(ABC):
                 return False
         return True
 
+    def acts_as_now(self) -> bool:
+        """Whether everything that acting reads is still bound."""
+        return self._has_same_things() and all(part.is_bound() for part in self.parts)
+
     def synchronize(self) -> bool:
         """Take over what was loaded or moved since the last update; return whether anything was."""
         if all(part.is_bound() for part in self.parts):
@@ -201,6 +205,16 @@ class EngineRuntime(Generic[EngineT]):
         elif self._engine is None:
             self._engine = self._class(self.models, self.compiles)
         return self._engine
+
+    def acting_engine(self) -> EngineT | None:
+        """Return what :meth:`engine` does, but check only what acting reads.
+
+        Checking the critics and the optimizers, too, would take half as long as acting.
+        """
+        engine = self._engine
+        if self.is_watched and engine is not None and engine.acts_as_now():
+            return engine
+        return self.engine()
 
     def _drop(self) -> None:
         """Discard the engine: the models keep their values in memory of their own."""
