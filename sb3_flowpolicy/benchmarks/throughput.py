@@ -39,7 +39,8 @@ Measure the speed of sb3_flowpolicy and of its baselines on this machine.
   learn         environment steps per second of learn(): SACFlow on TunnelDiagonal-v0 and PPOFlow
                 on Pendulum-v1 and HalfCheetah against SB3's
   her           the same with hindsight experience replay and dictionary observations
-  acting        calls of predict() per second: SAC and PPO, for one observation and for 100
+  acting        calls of predict() per second: SAC and PPO, for one observation and for 100;
+                steps per second of EvalCallback
   environments  steps per second of the environments, single and in batches of 64
   flow          RealNVP forward and backward against zuko's
 
