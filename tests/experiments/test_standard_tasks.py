@@ -89,6 +89,13 @@ def test_the_rule_tells_worse_from_not_worse() -> None:
     assert rule.verdict(rule.difference(-1.1 * stock, -stock, 100.0)) == "worse"
 
 
+@pytest.mark.filterwarnings("error")
+def test_seeds_that_all_succeed_give_an_interval_without_a_warning() -> None:
+    found = rule.difference(np.ones(10), np.eye(10)[0])
+    assert found.value == pytest.approx(0.9)
+    assert found.low == pytest.approx(0.9 - 2.262 * 0.1, abs=1e-3)  # Student's t, nine degrees
+
+
 def test_few_seeds_are_no_verdict_and_successes_are_not_relative() -> None:
     names = ["task", "algorithm", "policy", "seed", "step", "test_return", "test_success"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,9 @@ def difference(ours: np.ndarray, stock: np.ndarray, scale: float = 1.0) -> Estim
     mean = (ours.mean() - stock.mean()) / scale
     if np.ptp(ours) == np.ptp(stock) == 0.0:  # all seeds solve the task, or none does
         return Estimate(mean, mean, mean)
-    interval = ttest_ind(ours, stock, equal_var=False).confidence_interval(0.95)
+    with warnings.catch_warnings():  # about seeds of one policy that are all equal
+        warnings.simplefilter("ignore", RuntimeWarning)
+        interval = ttest_ind(ours, stock, equal_var=False).confidence_interval(0.95)
     return Estimate(mean, interval.low / scale, interval.high / scale)
 
 
