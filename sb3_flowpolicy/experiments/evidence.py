@@ -135,7 +135,7 @@ class Evidence:
         return curves.interpolate(method="index").bfill().loc[:end]
 
     def final(self, setting: str, agent: str, metric: str) -> np.ndarray:
-        """Return each seed's mean over the last tenth of its evaluations, (S,)."""
+        """Return each seed's mean over the last tenth of its evaluations, at least three, (S,)."""
         curves = self.curves(setting, agent, metric)
         return curves.tail(max(FINAL_LEAST, round(FINAL_SHARE * len(curves)))).mean().to_numpy()
 
