@@ -92,7 +92,7 @@ class SquareEnv(BatchEnv):
 
     The episode terminates when the square is not held in a step that begins after the warm-up
     (*dropped*), or when a finger is pushed out of its reach by more than 2 % (*broken*).
-    `SquareHold-v0` and `Square-v0` truncate it after 40 steps (10 s), the others after 80 (20 s).
+    `SquareHold` and `Square` truncate it after 40 steps (10 s), the others after 80 (20 s).
 
     ## Info
 
