@@ -83,12 +83,11 @@ def _acting(
     return act
 
 
-class Idle(gym.Env):
+class Idle(Unmoved):
     """Returns the same random observation at every step, so that only acting takes time."""
 
     def __init__(self) -> None:
-        self.observation_space = gym.spaces.Box(-1, 1, (OBS_DIM,), np.float32)
-        self.action_space = gym.spaces.Box(-1, 1, (ACTION_DIM,), np.float32)
+        super().__init__(OBS_DIM, ACTION_DIM)
         self.obs = np.random.default_rng(0).uniform(-1, 1, OBS_DIM).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:

@@ -37,8 +37,8 @@ class Engine(BoundEngine):
         self.critic_adam = FlatAdam(
             self.networks.critic, [policy.critic.optimizer for policy in policies]
         )
-        self.parts = [self.networks.actor, self.networks.critic, *self.networks.others]
-        self.parts += [self.actor_adam, self.critic_adam]
+        self.acting_parts = [self.networks.actor, *self.networks.others]
+        self.parts = [*self.acting_parts, self.networks.critic, self.actor_adam, self.critic_adam]
         self.log_ent_coef: FlatParameters | None = None
         self.ent_coef_adam: FlatAdam | None = None
         if first.ent_coef_optimizer is not None:
@@ -113,11 +113,6 @@ class Engine(BoundEngine):
         """Whether to call compiled functions: not after one could not be compiled."""
         eager = self._compiled_update.eager or self._compiled_sample.eager
         return self.compiled and not eager
-
-    def acts_as_now(self) -> bool:
-        """Whether the actor and its statistics are still bound."""
-        parts = (self.networks.actor, *self.networks.others)
-        return self._has_same_things() and all(part.is_bound() for part in parts)
 
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:

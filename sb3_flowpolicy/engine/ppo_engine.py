@@ -37,6 +37,7 @@ class PPOEngine(BoundEngine):
         names = {f"module.{name}": [value] for name, value in policy.named_parameters()}
         self.flat = FlatParameters([names])
         self.adam = FlatAdam(self.flat, [policy.optimizer])
+        self.acting_parts = [self.flat]
         self.parts = [self.flat, self.adam]
         places: list[Place] = [(vars(model), "policy"), (vars(policy), "optimizer")]
         for module in policy.modules():

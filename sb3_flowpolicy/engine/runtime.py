@@ -34,6 +34,8 @@ class BoundEngine(ABC):
 
     #: Everything that is bound.
     parts: list[FlatParameters | FlatAdam]
+    #: Those of them that acting reads.
+    acting_parts: list[FlatParameters]
 
     def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:
         self.models = list(models)
@@ -68,7 +70,7 @@ class BoundEngine(ABC):
 
     def acts_as_now(self) -> bool:
         """Whether everything that acting reads is still bound."""
-        return self._has_same_things() and all(part.is_bound() for part in self.parts)
+        return self._has_same_things() and all(part.is_bound() for part in self.acting_parts)
 
     def synchronize(self) -> bool:
         """Take over what was loaded or moved since the last update; return whether anything was."""
