@@ -347,6 +347,9 @@ class ActInCallback(BaseCallback):
         if self.num_timesteps == 35:  # other weights have to be noticed
             for parameter in self.model.actor.parameters():
                 parameter.data.add_(0.1)
+        if self.num_timesteps == 37:  # and weights in other memory
+            for parameter in self.model.actor.parameters():
+                parameter.data = parameter.data - 0.1
         rng = np.random.default_rng(self.num_timesteps)
         one = rng.normal(size=3).astype(np.float32)
         for obs in (one, one[None], one.astype(np.float64), np.stack([one, -one])):
