@@ -8,6 +8,7 @@ import pytest
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.dimensions.__main__ import main
+from sb3_flowpolicy.experiments.dimensions.discovery import DISTANCE, chance, discovery
 from sb3_flowpolicy.experiments.dimensions.prediction import (
     FAMILIES,
     REACH,
@@ -73,6 +74,47 @@ def test_correlation_is_worth_less_in_more_dimensions():
         assert alone["progress"] < joint["progress"]
         gaps.append(joint["entropy"] - alone["entropy"])
     assert gaps[0] > 2 * gaps[1] > 2 * gaps[2] > 0.5
+
+
+def test_the_distance_is_that_of_the_environment():
+    env = gym.make("TunnelDiagonal-v0").unwrapped
+    env.reset(seed=0)
+    for _ in range(int(DISTANCE)):
+        assert not env.step(np.ones(2, np.float32))[2]
+    *_, terminated, _, info = env.step(np.full(2, DISTANCE % 1 + 1e-4, np.float32))
+    assert terminated
+    assert info["is_success"]
+
+
+@pytest.mark.parametrize("survival", [1.0, 0.97])
+def test_chance_is_that_of_a_random_walk(survival):
+    rng = np.random.default_rng(0)
+    there = rng.normal(0.0, 0.6, (200_000, 40)).cumsum(1) >= DISTANCE
+    expected = (there.any(1) * survival ** (there.argmax(1) + 1)).mean()
+    assert chance(0.6, survival) == pytest.approx(expected, rel=0.03)
+
+
+def test_correlated_noise_finds_the_goal_up_to_four_dimensions():
+    goals = [discovery("correlated", dims, WIDTHS[dims])["goals"] for dims in (2, 4, 8)]
+    assert goals[0] > goals[1] > 1 > goals[2]
+    assert all(discovery("independent", dims, WIDTHS[dims])["goals"] < 1e-9 for dims in (2, 4, 8))
+
+
+@pytest.mark.parametrize("results", [True, False])
+def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(
+        "sb3_flowpolicy.experiments.dimensions.__main__.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
+    )
+    if results:
+        make_up("diagonal-widened")
+    command = ["--figure", str(tmp_path / "p.png"), "--results", str(tmp_path)]
+    if results:
+        main(command)
+        assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    else:
+        with pytest.raises(ValueError, match="--results must hold results of diagonal-widened"):
+            main(command)
 
 
 def test_the_command_writes_what_it_prints(tmp_path, capsys, monkeypatch):

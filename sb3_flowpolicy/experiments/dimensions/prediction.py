@@ -14,6 +14,7 @@ with the mean :math:`\bar a` of its coordinates, the width :math:`w` and the rea
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -89,20 +90,40 @@ def best(family: str, dims: int, width: float, survival: float) -> dict[str, flo
 
     Returns:
         ``entropy`` in nats; ``progress``, the standard deviation of the mean coordinate of an
-        action, which is the progress along the tunnel as a share of the reach; and the standard
-        deviations before tanh of each coordinate's own noise, ``scale``, and of the noise that all
-        coordinates share, ``common``.
+        action, which is the progress along the tunnel as a share of the reach; ``survival``; and
+        the standard deviations before tanh of each coordinate's own noise, ``scale``, and of the
+        noise that all coordinates share, ``common``.
     """
-    rng = np.random.default_rng(0)
-    shared, own = rng.standard_normal((_SAMPLES, 1)), rng.standard_normal((_SAMPLES, dims))
+    shared, own = _samples(dims)
     candidates = []
     for common in FAMILIES[family]:
         scale = _widest(common * shared, own, width, survival)
-        progress = float(np.tanh(common * shared + scale * own).mean(axis=1).std())
-        entropy = _entropy(dims, scale, common)
-        found = {"entropy": entropy, "progress": progress, "scale": scale, "common": float(common)}
-        candidates.append(found)
+        candidates.append(noise_of(dims, width, scale, common))
     return max(candidates, key=lambda found: found["entropy"])
+
+
+def noise_of(dims: int, width: float, scale: float, common: float) -> dict[str, float]:
+    """Describe the noise tanh(common z 1 + scale e) at the center of the tunnel.
+
+    Returns:
+        As :func:`best`; ``survival`` is the probability with which a step survives.
+    """
+    shared, own = _samples(dims)
+    actions = np.tanh(common * shared + scale * own)
+    return {
+        "entropy": _entropy(dims, scale, common),
+        "progress": float(actions.mean(axis=1).std()),
+        "survival": survival_of(actions, width),
+        "scale": scale,
+        "common": float(common),
+    }
+
+
+@functools.cache
+def _samples(dims: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return standard normal noise that all coordinates share, (N, 1), and their own, (N, D)."""
+    rng = np.random.default_rng(0)
+    return rng.standard_normal((_SAMPLES, 1)), rng.standard_normal((_SAMPLES, dims))
 
 
 def _widest(

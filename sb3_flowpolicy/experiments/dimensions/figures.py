@@ -1,0 +1,99 @@
+"""Figures of the diagonal tunnels that are equally likely to be entered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from sb3_flowpolicy.common.statistics import interquartile_mean
+from sb3_flowpolicy.diagnostics.figures import new_figure
+from sb3_flowpolicy.experiments.evidence import Evidence
+from sb3_flowpolicy.experiments.experiment import GAUSS, LOW_RANK
+from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_FAMILIES = (
+    ("LR (any rank), full covariance", "correlated", LOW_RANK.color),
+    ("Gauss", "independent", GAUSS.color),
+)
+
+
+def prediction_figure(table: pd.DataFrame, survival: float) -> Figure:
+    """Draw entropy and progress at equal survival by number of dimensions.
+
+    Args:
+        table: A row per number of dimensions, as the command prints it.
+        survival: Probability with which a step survives.
+    """
+    figure = new_figure(9.0, 3.4)
+    left, right = figure.subplots(1, 2)
+    left.plot(table["bound"] - table["uniform"], "o-", color="#555555", label="any", markersize=4)
+    for label, name, shade in _FAMILIES:
+        entropy = table[f"{name}.entropy"]
+        left.plot(entropy - table["uniform"], "o-", color=shade, label=label, markersize=4)
+        right.plot(table[f"{name}.progress"], "o-", color=shade, markersize=4)
+    left.set(title="highest entropy, less that of the uniform density", ylabel="nats")
+    right.set(title="standard deviation of the progress of a step", ylabel="share of the reach")
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(table.index, table.index.astype(str))
+        axes.minorticks_off()
+        axes.set_xlabel(f"coupled dimensions; {survival:.0%} of the steps survive")
+        axes.grid(color="#eeeeee")
+    right.set_ylim(bottom=0.0)
+    left.legend(frameon=False, title="density")
+    return figure
+
+
+def results_figure(table: pd.DataFrame, results: Path) -> Figure:
+    """Draw how many seeds solve the task, and after how many steps, by number of dimensions.
+
+    Broken lines are the predicted numbers of seeds that find the goal by noise alone.
+
+    Raises:
+        ValueError: If the folder has no results of the experiment.
+    """
+    experiment = EXPERIMENTS["diagonal-widened"]
+    evidence = Evidence(experiment, results / experiment.name)
+    if not evidence.measured:
+        raise ValueError(f"--results must hold results of {experiment.name}, got none in {results}")
+    figure = new_figure(9.0, 3.8)
+    left, right = figure.subplots(1, 2)
+    for place, agent in enumerate(experiment.agents):
+        dims = [d for d in table.index if (f"{d}-dimensions", agent.name) in _measured(evidence)]
+        pairs = [(f"{d}-dimensions", agent.name) for d in dims]
+        # Beside each other, as most agents solve either all seeds or none.
+        at = table.index.get_indexer(dims) + 0.09 * (place - (len(experiment.agents) - 1) / 2)
+        style = {"color": agent.color, "label": agent.label, "markersize": 4, "linewidth": 1}
+        left.plot(at, [evidence.solved_once(*pair).sum() for pair in pairs], "o-", **style)
+        steps = [interquartile_mean(evidence.steps_until_solved(*pair)) for pair in pairs]
+        middle = np.array([one.value for one in steps])
+        bars = np.abs(np.array([[one.low, one.high] for one in steps]).T - middle)
+        right.errorbar(at, middle, bars, fmt="o-", **style, elinewidth=0.8)
+    for label, name, shade in _FAMILIES:
+        seeds = experiment.seeds * table[f"{name}.before_reward.seeds"]
+        left.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
+    left.set(title="seeds that solve the task at their best", ylabel=f"of {experiment.seeds}")
+    right.set(title="steps until solved", ylim=(0.0, None))
+    for axes in (left, right):
+        _label_dimensions(axes, table.index)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False
+    )
+    return figure
+
+
+def _measured(evidence: Evidence) -> set[tuple[str, str]]:
+    return {(setting.name, agent.name) for setting, agent in evidence.measured}
+
+
+def _label_dimensions(axes: Axes, dims: pd.Index) -> None:
+    axes.set_xticks(range(len(dims)), dims.astype(str))
+    axes.set_xlabel("coupled dimensions")
+    axes.grid(color="#eeeeee")
