@@ -1,4 +1,4 @@
-"""Tunnels of many dimensions: widths against the environment, entropy against samples."""
+"""Tunnels of many dimensions: widths against the environment, predictions against samples."""
 
 import json
 
@@ -8,7 +8,14 @@ import pytest
 
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy.experiments.dimensions.__main__ import main
-from sb3_flowpolicy.experiments.dimensions.discovery import DISTANCE, chance, discovery
+from sb3_flowpolicy.experiments.dimensions.discovery import (
+    _EPISODE,
+    _STEPS,
+    DISTANCE,
+    _value,
+    chance,
+    discovery,
+)
 from sb3_flowpolicy.experiments.dimensions.prediction import (
     FAMILIES,
     REACH,
@@ -72,6 +79,8 @@ def test_correlation_is_worth_less_in_more_dimensions():
         alone, joint = (best(name, dims, WIDTHS[dims], 0.9) for name in FAMILIES)
         assert alone["entropy"] < joint["entropy"] < bound(dims, 0.9)
         assert alone["progress"] < joint["progress"]
+        assert alone["survival"] == pytest.approx(0.9, abs=0.001)
+        assert joint["survival"] == pytest.approx(0.9, abs=0.001)
         gaps.append(joint["entropy"] - alone["entropy"])
     assert gaps[0] > 2 * gaps[1] > 2 * gaps[2] > 0.5
 
@@ -81,7 +90,8 @@ def test_the_distance_is_that_of_the_environment():
     env.reset(seed=0)
     for _ in range(int(DISTANCE)):
         assert not env.step(np.ones(2, np.float32))[2]
-    *_, terminated, _, info = env.step(np.full(2, DISTANCE % 1 + 1e-4, np.float32))
+    assert not env.step(np.full(2, DISTANCE % 1 - 1e-4, np.float32))[2]
+    *_, terminated, _, info = env.step(np.full(2, 2e-4, np.float32))
     assert terminated
     assert info["is_success"]
 
@@ -92,6 +102,30 @@ def test_chance_is_that_of_a_random_walk(survival):
     there = rng.normal(0.0, 0.6, (200_000, 40)).cumsum(1) >= DISTANCE
     expected = (there.any(1) * survival ** (there.argmax(1) + 1)).mean()
     assert chance(0.6, survival) == pytest.approx(expected, rel=0.03)
+
+
+def test_the_value_is_the_discounted_sum_of_entropy_and_penalty():
+    # The settings of TunnelDiagonal-v0: coefficient 0.0025, penalty 0.1, discount 0.8.
+    entropy, survival = -1.5, 0.9
+    reached = 0.8 ** np.arange(400) * survival ** np.arange(400)
+    expected = (reached * (0.0025 * entropy - 0.1 * (1 - survival))).sum()
+    assert _value({"entropy": entropy, "survival": survival}) == pytest.approx(expected)
+
+
+def test_goals_are_those_of_simulated_noise():
+    found = discovery("correlated", 2, WIDTHS[2])
+    rng, count = np.random.default_rng(0), 40_000
+    place, running, goals, steps = np.zeros(count), np.ones(count, bool), 0, 0
+    for _ in range(_EPISODE):
+        steps += running.sum()
+        shared, own = rng.standard_normal((count, 1)), rng.standard_normal((count, 2))
+        actions = np.tanh(found["common"] * shared + found["scale"] * own)
+        place += actions.mean(axis=1)
+        offsets = np.linalg.norm(actions - actions.mean(axis=1, keepdims=True), axis=1)
+        running &= (offsets <= WIDTHS[2] / (2 * REACH)) & (place >= -1 / REACH)
+        goals += (running & (place >= DISTANCE)).sum()
+        running &= place < DISTANCE
+    assert found["goals"] == pytest.approx(_STEPS / steps * goals, rel=0.15)
 
 
 def test_correlated_noise_finds_the_goal_up_to_four_dimensions():

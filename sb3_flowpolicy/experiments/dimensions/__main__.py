@@ -1,4 +1,4 @@
-"""`python -m sb3_flowpolicy.experiments.dimensions`: predictions, and what the agents did."""
+"""`python -m sb3_flowpolicy.experiments.dimensions`: predictions, and the agents' results."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m sb3_flowpolicy.experiments.dimensions",
         description="Diagonal tunnels whose random first steps survive equally often: predict the "
-        "highest entropy of independent and of correlated noise, and how many runs find the goal; "
-        "draw this, and the results of `experiments run diagonal-widened` beside it.",
+        "highest entropy of independent and of correlated noise, and how often noise finds the "
+        "goal. The figure shows the entropy, or with --results how many seeds solve the task.",
         formatter_class=HelpFormatter,
     )
     survival = "probability with which a step of the policy survives"
     parser.add_argument("--survival", type=float, default=0.9, help=survival)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results there")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw them as PNG")
-    results = "folder with the results of experiment diagonal-widened, to draw them"
+    results = "folder with the results of experiment diagonal-widened, to draw these instead"
     parser.add_argument("--results", type=Path, metavar="FOLDER", help=results)
     args = parser.parse_args(arguments)
     if not 0.0 < args.survival < 1.0:
@@ -50,10 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for dims, width in WIDTHS.items()
     ]
     table = pd.json_normalize(rows).set_index("dims")
-    told = ["width", "uniform", "bound"]
-    shown = ("entropy", "progress", "before_reward.goals")
-    told += [f"{family}.{what}" for what in shown for family in FAMILIES]
-    print(table[told].to_string(float_format="{:.4f}".format))
+    columns = ["width", "uniform", "bound"]
+    predicted = ("entropy", "progress", "before_reward.goals")
+    columns += [f"{family}.{name}" for name in predicted for family in FAMILIES]
+    print(table[columns].to_string(float_format="{:.4f}".format))
     if args.json is not None:
         write_json(args.json, {"survival": args.survival, "rows": rows})
     if args.figure is not None:

@@ -15,8 +15,9 @@ with probability
 
 (the reflection principle, with the correction for discrete steps by Broadie, Glasserman and Kou, *A
 continuity correction for discrete barrier options*, 1997), so that an episode of N steps reaches
-the goal with probability :math:`\sum_{n=1}^N s^n (F(n) - F(n - 1))`. Means that move the agent are
-not part of this, nor is what it learns from its first goal.
+the goal with probability :math:`\sum_{n=1}^N s^n (F(n) - F(n - 1))`. This treats steps as normal,
+and as independent of survival, and ignores the other end of the world. Means that move the agent
+are not part of it, nor is what an agent learns from its first goal.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _HYPERPARAMETERS = load_hyperparameters("sac_flow", _ENV)
 _STEPS: int = _HYPERPARAMETERS["n_timesteps"]
 _EPISODE: int = gym.spec(_ENV).max_episode_steps  # type: ignore[assignment]
 DISTANCE = 0.9 / REACH
-"""From the start, the origin, to the goal, whose coordinates are all 0.9, in reaches."""
+"""Distance from the start, the origin, to the goal along each axis, in reaches."""
 _CORRECTION = 0.583
 _SCALES = np.geomspace(0.003, 0.88, 40)
 
@@ -52,8 +53,9 @@ def discovery(family: str, dims: int, width: float) -> dict[str, float]:
     Returns:
         ``survival`` of a step and ``progress``, its standard deviation along the tunnel as a share
         of the reach; ``entropy`` in nats; ``chance``, the probability that an episode reaches the
-        goal; ``goals``, how many episodes of a run do; and ``seeds``, the share of runs in which at
-        least one does.
+        goal; ``goals``, the expected number of episodes of a run that do; and ``seeds``, the share
+        of runs in which at least one does. Also the standard deviations before tanh, ``scale`` and
+        ``common``, as of :func:`~sb3_flowpolicy.experiments.dimensions.prediction.best`.
 
     Example:
         >>> from sb3_flowpolicy.experiments.dimensions.prediction import WIDTHS

@@ -80,7 +80,7 @@ def bound(dims: int, survival: float) -> float:
 
 
 def best(family: str, dims: int, width: float, survival: float) -> dict[str, float]:
-    """Find the policy of a family that has the highest entropy at the center of the tunnel.
+    """Find the noise of a family with the highest entropy at the center line at this survival.
 
     Args:
         family: Key of ``FAMILIES``.
