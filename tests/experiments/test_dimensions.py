@@ -131,11 +131,13 @@ def test_goals_are_those_of_simulated_noise():
 def test_correlated_noise_finds_the_goal_up_to_four_dimensions():
     goals = [discovery("correlated", dims, WIDTHS[dims])["goals"] for dims in (2, 4, 8)]
     assert goals[0] > goals[1] > 1 > goals[2]
+    for dims, goal in zip((2, 4, 8), goals, strict=True):
+        assert discovery("any", dims, WIDTHS[dims])["goals"] > goal
     assert all(discovery("independent", dims, WIDTHS[dims])["goals"] < 1e-9 for dims in (2, 4, 8))
 
 
 @pytest.mark.parametrize("results", [True, False])
-def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch):
+def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(
         "sb3_flowpolicy.experiments.dimensions.__main__.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
@@ -147,8 +149,9 @@ def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch):
         main(command)
         assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     else:
-        with pytest.raises(ValueError, match="--results must hold results of diagonal-widened"):
+        with pytest.raises(SystemExit):
             main(command)
+        assert "--results: no results of diagonal-widened" in capsys.readouterr().err
 
 
 def test_the_command_writes_what_it_prints(tmp_path, capsys, monkeypatch):

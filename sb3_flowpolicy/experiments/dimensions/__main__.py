@@ -33,6 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     if not 0.0 < args.survival < 1.0:
         parser.error(f"--survival must be in (0, 1), got {args.survival}")
+    if args.results is not None and args.figure is None:
+        parser.error("--results needs --figure")
     for name in ("json", "figure"):
         check_folder_of(parser, f"--{name}", getattr(args, name))
     rows = [
@@ -41,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "width": width,
             "uniform": dims * math.log(2.0),
             "bound": bound(dims, args.survival),
+            "any": {"before_reward": discovery("any", dims, width)},
             **{
                 name: best(name, dims, width, args.survival)
                 | {"before_reward": discovery(name, dims, width)}
@@ -51,8 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     table = pd.json_normalize(rows).set_index("dims")
     columns = ["width", "uniform", "bound"]
-    predicted = ("entropy", "progress", "before_reward.goals")
-    columns += [f"{family}.{name}" for name in predicted for family in FAMILIES]
+    columns += [f"{family}.{name}" for name in ("entropy", "progress") for family in FAMILIES]
+    columns += [f"{family}.before_reward.goals" for family in ("any", *FAMILIES)]
     print(table[columns].to_string(float_format="{:.4f}".format))
     if args.json is not None:
         write_json(args.json, {"survival": args.survival, "rows": rows})
@@ -60,10 +63,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Slow imports that the table does not need.
         from sb3_flowpolicy.experiments.dimensions.figures import prediction_figure, results_figure
 
-        if args.results is None:
-            figure = prediction_figure(table, args.survival)
-        else:
-            figure = results_figure(table, args.results)
+        try:
+            figure = (
+                prediction_figure(table, args.survival)
+                if args.results is None
+                else results_figure(table, args.results)
+            )
+        except ValueError as error:
+            parser.error(f"--results: {error}")
         figure.savefig(args.figure, dpi=110)
 
 

@@ -29,7 +29,13 @@ import numpy as np
 
 from flowpolicy_envs.registration import TUNNEL_IDS
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
-from sb3_flowpolicy.experiments.dimensions.prediction import FAMILIES, REACH, noise_of
+from sb3_flowpolicy.experiments.dimensions.prediction import (
+    FAMILIES,
+    REACH,
+    bound,
+    noise_of,
+    survives,
+)
 
 _ENV = "TunnelDiagonal-v0"
 _TUNNEL = TUNNEL_IDS[_ENV]
@@ -40,22 +46,25 @@ DISTANCE = 0.9 / REACH
 """Distance from the start, the origin, to the goal along each axis, in reaches."""
 _CORRECTION = 0.583
 _SCALES = np.geomspace(0.003, 0.88, 40)
+_UNIFORM_SAMPLES = 200_000
 
 
 def discovery(family: str, dims: int, width: float) -> dict[str, float]:
     """Predict how often a run finds the goal with the noise that it prefers without a reward.
 
     Args:
-        family: Key of ``FAMILIES``.
+        family: Key of ``FAMILIES``, or ``"any"`` for the density of any shape with the highest
+            entropy, which is uniform inside the tunnel.
         dims: Number of coupled dimensions, at least 2.
         width: Width of the tunnel, world units.
 
     Returns:
         ``survival`` of a step and ``progress``, its standard deviation along the tunnel as a share
         of the reach; ``entropy`` in nats; ``chance``, the probability that an episode reaches the
-        goal; ``goals``, the expected number of episodes of a run that do; and ``seeds``, the share
-        of runs in which at least one does. Also the standard deviations before tanh, ``scale`` and
-        ``common``, as of :func:`~sb3_flowpolicy.experiments.dimensions.prediction.best`.
+        goal; ``goals``, the expected number of episodes of a run that do; and ``runs``, the share
+        of runs in which at least one does. Of normal noise also the standard deviations before
+        tanh, ``scale`` and ``common``, as of
+        :func:`~sb3_flowpolicy.experiments.dimensions.prediction.best`.
 
     Example:
         >>> from sb3_flowpolicy.experiments.dimensions.prediction import WIDTHS
@@ -63,17 +72,30 @@ def discovery(family: str, dims: int, width: float) -> dict[str, float]:
         >>> found["goals"] > 10 > discovery("independent", 2, WIDTHS[2])["goals"]
         True
     """
-    candidates = [
-        noise_of(dims, width, float(scale), common)
-        for common in FAMILIES[family]
-        for scale in _SCALES
-    ]
+    if family == "any":
+        candidates = _uniform(dims, width)
+    else:
+        candidates = [
+            noise_of(dims, width, float(scale), common)
+            for common in FAMILIES[family]
+            for scale in _SCALES
+        ]
     found = max(candidates, key=_value)
     survival = found["survival"]
     reached = chance(found["progress"], survival)
     length = sum(survival**n for n in range(_EPISODE))
     goals = _STEPS / length * reached
-    return {**found, "chance": reached, "goals": goals, "seeds": -math.expm1(-goals)}
+    return {**found, "chance": reached, "goals": goals, "runs": -math.expm1(-goals)}
+
+
+def _uniform(dims: int, width: float) -> list[dict[str, float]]:
+    """Describe densities that are uniform inside the tunnel and uniform, but lower, outside."""
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (_UNIFORM_SAMPLES, dims))
+    progress = float(actions[survives(actions, width)].mean(axis=1).std())
+    return [
+        {"entropy": bound(dims, survival), "progress": progress, "survival": survival}
+        for survival in 1.0 - np.geomspace(1e-4, 0.5, 60)
+    ]
 
 
 def _value(noise: dict[str, float]) -> float:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_ANY = ("any density", "any", "#555555")
 _FAMILIES = (
     ("LR (any rank), full covariance", "correlated", LOW_RANK.color),
     ("Gauss", "independent", GAUSS.color),
@@ -33,7 +34,8 @@ def prediction_figure(table: pd.DataFrame, survival: float) -> Figure:
     """
     figure = new_figure(9.0, 3.4)
     left, right = figure.subplots(1, 2)
-    left.plot(table["bound"] - table["uniform"], "o-", color="#555555", label="any", markersize=4)
+    label, _, shade = _ANY
+    left.plot(table["bound"] - table["uniform"], "o-", color=shade, label=label, markersize=4)
     for label, name, shade in _FAMILIES:
         entropy = table[f"{name}.entropy"]
         left.plot(entropy - table["uniform"], "o-", color=shade, label=label, markersize=4)
@@ -47,7 +49,7 @@ def prediction_figure(table: pd.DataFrame, survival: float) -> Figure:
         axes.set_xlabel(f"coupled dimensions; {survival:.0%} of the steps survive")
         axes.grid(color="#eeeeee")
     right.set_ylim(bottom=0.0)
-    left.legend(frameon=False, title="density")
+    left.legend(frameon=False)
     return figure
 
 
@@ -62,7 +64,7 @@ def results_figure(table: pd.DataFrame, results: Path) -> Figure:
     experiment = EXPERIMENTS["diagonal-widened"]
     evidence = Evidence(experiment, results / experiment.name)
     if not evidence.measured:
-        raise ValueError(f"--results must hold results of {experiment.name}, got none in {results}")
+        raise ValueError(f"no results of {experiment.name} in {results}")
     figure = new_figure(9.0, 3.8)
     left, right = figure.subplots(1, 2)
     for place, agent in enumerate(experiment.agents):
@@ -76,8 +78,8 @@ def results_figure(table: pd.DataFrame, results: Path) -> Figure:
         middle = np.array([one.value for one in steps])
         bars = np.abs(np.array([[one.low, one.high] for one in steps]).T - middle)
         right.errorbar(at, middle, bars, fmt="o-", **style, elinewidth=0.8)
-    for label, name, shade in _FAMILIES:
-        seeds = experiment.seeds * table[f"{name}.before_reward.seeds"]
+    for label, name, shade in (_ANY, *_FAMILIES):
+        seeds = experiment.seeds * table[f"{name}.before_reward.runs"]
         left.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
     left.set(title="seeds that solve the task at their best", ylabel=f"of {experiment.seeds}")
     right.set(title="steps until solved", ylim=(0.0, None))

@@ -55,8 +55,13 @@ _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(200)
 
 def survival_of(actions: NDArray[np.float64], width: float) -> float:
     """Return the share of actions (N, D) at the center line that stay in the tunnel."""
+    return float(survives(actions, width).mean())
+
+
+def survives(actions: NDArray[np.float64], width: float) -> NDArray[np.bool_]:
+    """Return which actions (N, D) at the center line stay in the tunnel, (N,)."""
     offsets = np.linalg.norm(actions - actions.mean(axis=1, keepdims=True), axis=1)
-    return float((offsets <= width / (2.0 * REACH)).mean())
+    return offsets <= width / (2.0 * REACH)
 
 
 def bound(dims: int, survival: float) -> float:
