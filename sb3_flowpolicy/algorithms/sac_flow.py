@@ -53,7 +53,7 @@ class SACFlow(EngineFlow, SAC):
         critic_loss_coef: Factor of the critics' summed mean squared error, above 0: 0.5 as in
             SB3, or 1.0 as in spinningup and the thesis. With Adam the factor cancels except for
             weight decay, which weighs half as much at 1.0.
-        compile: Whether to compile the update: several times faster after 10 to 30 seconds of
+        compile: Whether to compile the update: several times faster after 5 to 30 seconds of
             warm-up. ``"auto"`` compiles once calls of :meth:`learn` have planned enough updates to
             repay it. Compiled or not, the numbers are
             the same up to rounding.

@@ -15,7 +15,7 @@ import torch as th
 class Compiled:
     """A function of tensors compiled into one graph per kind of call; its closure must not change.
 
-    Compilation happens at the first call, which says so: the SAC update takes 10 to 30 seconds,
+    Compilation happens at the first call, which says so: the SAC update takes 5 to 30 seconds,
     less from the second run on, as torch caches it on disk. Where it fails, for want of a C++
     compiler or of a feature of torch, the function runs eagerly from then on, with one warning.
     """
