@@ -46,7 +46,9 @@ class Task(NamedTuple):
     def settings(self, algorithm: str) -> dict[str, Any]:
         """Return the task's own settings, or those that rl_zoo3 publishes, without gSDE.
 
-        gSDE is not a density; ``log_std_init`` goes with it.
+        gSDE is not a density; ``log_std_init`` goes with it, as gSDE multiplies the features with
+        noise of that size. Noise of that size itself is too small: PPO with ``log_std_init=-2``
+        stayed at -1100 on HalfCheetah for 150,000 steps, where it reached some 500 without.
         """
         if self.own_settings is not None:
             return dict(self.own_settings[algorithm])
