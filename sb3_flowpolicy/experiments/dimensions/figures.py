@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _ANY = ("any density", "any", "#555555")
 _FAMILIES = (
-    ("LR (any rank), full covariance", "correlated", LOW_RANK.color),
+    ("LR, full covariance", "correlated", LOW_RANK.color),
     ("Gauss", "independent", GAUSS.color),
 )
 
@@ -65,7 +65,7 @@ def results_figure(table: pd.DataFrame, results: Path) -> Figure:
     evidence = Evidence(experiment, results / experiment.name)
     if not evidence.measured:
         raise ValueError(f"no results of {experiment.name} in {results}")
-    figure = new_figure(9.0, 3.8)
+    figure = new_figure(9.0, 4.2)
     left, right = figure.subplots(1, 2)
     for place, agent in enumerate(experiment.agents):
         dims = [d for d in table.index if (f"{d}-dimensions", agent.name) in _measured(evidence)]
@@ -83,10 +83,11 @@ def results_figure(table: pd.DataFrame, results: Path) -> Figure:
         left.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
     left.set(title="seeds that solve the task at their best", ylabel=f"of {experiment.seeds}")
     right.set(title="steps until solved", ylim=(0.0, None))
+    right.yaxis.set_major_formatter("{x:,.0f}")
     for axes in (left, right):
         _label_dimensions(axes, table.index)
     figure.legend(
-        *left.get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False
+        *left.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False
     )
     return figure
 
