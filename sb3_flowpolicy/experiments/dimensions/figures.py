@@ -15,7 +15,6 @@ from sb3_flowpolicy.experiments.experiment import GAUSS, LOW_RANK
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _ANY = ("any density", "any", "#555555")
@@ -68,7 +67,7 @@ def results_figure(table: pd.DataFrame, results: Path) -> Figure:
     figure = new_figure(9.0, 4.2)
     left, right = figure.subplots(1, 2)
     for place, agent in enumerate(experiment.agents):
-        dims = [d for d in table.index if (f"{d}-dimensions", agent.name) in _measured(evidence)]
+        dims = [d for d in table.index if evidence.columns(f"{d}-dimensions", agent.name)]
         pairs = [(f"{d}-dimensions", agent.name) for d in dims]
         # Beside each other, as most agents solve either all seeds or none.
         at = table.index.get_indexer(dims) + 0.09 * (place - (len(experiment.agents) - 1) / 2)
@@ -85,18 +84,10 @@ def results_figure(table: pd.DataFrame, results: Path) -> Figure:
     right.set(title="steps until solved", ylim=(0.0, None))
     right.yaxis.set_major_formatter("{x:,.0f}")
     for axes in (left, right):
-        _label_dimensions(axes, table.index)
+        axes.set_xticks(range(len(table)), table.index.astype(str))
+        axes.set_xlabel("coupled dimensions")
+        axes.grid(color="#eeeeee")
     figure.legend(
         *left.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False
     )
     return figure
-
-
-def _measured(evidence: Evidence) -> set[tuple[str, str]]:
-    return {(setting.name, agent.name) for setting, agent in evidence.measured}
-
-
-def _label_dimensions(axes: Axes, dims: pd.Index) -> None:
-    axes.set_xticks(range(len(dims)), dims.astype(str))
-    axes.set_xlabel("coupled dimensions")
-    axes.grid(color="#eeeeee")
