@@ -113,7 +113,7 @@ def test_spline_offset_is_the_least_distance_to_the_polyline(waypoints):
 
 
 def test_polyline_contains_the_corners():
-    points = L_SHAPE.polyline(0.0, 1.0, spacing=0.3)
+    points = L_SHAPE.polyline(0.0, 1.0)
     assert [0.5, 0.0] in points.tolist()
     assert points[0] == pytest.approx([0.0, 0.0])
     assert points[-1] == pytest.approx([0.5, 0.5])

@@ -87,11 +87,10 @@ class Path:
         """
         return locate(self.kind, self.numbers, self.table, np.asarray(position, np.float64))
 
-    def polyline(self, start: float, stop: float, spacing: float = 0.01) -> FloatArray:
+    def polyline(self, start: float, stop: float) -> FloatArray:
         """Return points (K, D) of the center line from arc `start` to `stop`, corners included."""
-        arcs = np.linspace(start, stop, 2 + int(abs(stop - start) / spacing))
-        low, high = sorted((start, stop))
-        corners = self.table[(self.table[:, 2] > low) & (self.table[:, 2] < high), 2]
+        arcs = np.linspace(start, stop, 2 + int((stop - start) / 0.01))
+        corners = self.table[(self.table[:, 2] > start) & (self.table[:, 2] < stop), 2]
         return np.stack([self.point(arc) for arc in np.union1d(arcs, corners)])
 
 
