@@ -15,6 +15,7 @@ RENDER_MODES = ("human", "rgb_array")
 RENDER_FPS = 10
 
 WHITE = (255, 255, 255)
+BORDER = (60, 60, 60)
 
 _SUPERSAMPLING = 3
 """Pictures are drawn this much larger and scaled down, which smooths the edges."""
@@ -27,7 +28,7 @@ def check_render_mode(render_mode: str | None, modes: tuple[str, ...]) -> None:
 
 
 class Canvas(ABC):
-    """A square picture of the world [-view, view]^2, in a window or as an array.
+    """A square picture of the world and its border, in a window or as an array.
 
     A subclass draws the static part in `_draw_background`, which is called once, and the rest in
     `_draw`.
@@ -40,7 +41,7 @@ class Canvas(ABC):
     """
 
     caption: ClassVar[str]
-    view: ClassVar[float]
+    view: ClassVar[float] = 1.04
     """Half the edge of the picture in world units."""
     fps: ClassVar[int] = RENDER_FPS
 
@@ -103,9 +104,16 @@ class Canvas(ABC):
             self._background = pygame.Surface((self._edge, self._edge), 0, 32)
             self._background.fill(WHITE)
             self._draw_background(self._background)
+            pygame.draw.rect(self._background, BORDER, self._world(), width=self._pixels(0.006))
         canvas = self._background.copy()
         self._draw(canvas, *scene)
         return pygame.transform.smoothscale(canvas, (self._size, self._size))
+
+    def _world(self) -> "pygame.Rect":
+        import pygame
+
+        low, high = self._screen(np.array([[-1.0, 1.0], [1.0, -1.0]])).round()
+        return pygame.Rect(*low, *(high - low))
 
     def _dots(
         self,

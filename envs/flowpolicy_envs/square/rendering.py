@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flowpolicy_envs.canvas import Canvas
+from flowpolicy_envs.canvas import BORDER, WHITE, Canvas
 from flowpolicy_envs.square import kernels
 from flowpolicy_envs.square.batch import END_REASONS, SquareBatch
 from flowpolicy_envs.square.config import SquareConfig
@@ -20,9 +20,7 @@ RENDER_FPS = 4
 COLORS = ((214, 39, 40), (31, 119, 180), (44, 150, 44), (230, 130, 14))
 """Colors of the fingers: right, top, left, bottom."""
 
-_BORDER = (60, 60, 60)
 _SQUARE = (25, 25, 25)
-_MARK = (255, 255, 255)
 _TEXT = (60, 60, 60)
 _HELD = (40, 180, 70)
 _LOOSE = (205, 205, 205)
@@ -55,7 +53,6 @@ class Renderer(Canvas):
     """
 
     caption = "Square"
-    view = 1.04
     fps = RENDER_FPS
 
     def __init__(self, config: SquareConfig, size: int) -> None:
@@ -75,9 +72,6 @@ class Renderer(Canvas):
             pygame.draw.polygon(canvas, _REGION, band)
             for end in ends:
                 pygame.draw.circle(canvas, _REGION, end, radius)
-        low, high = self._screen(np.array([[-1.0, 1.0], [1.0, -1.0]])).round()
-        world = pygame.Rect(*low, *(high - low))
-        pygame.draw.rect(canvas, _BORDER, world, width=self._pixels(0.006))
 
     def _draw(
         self,
@@ -103,8 +97,8 @@ class Renderer(Canvas):
         local = half * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [0, 0], [0, 0.8]])
         points = self._screen(local @ turn + (x, y))
         pygame.draw.polygon(canvas, _SQUARE, points[:4])
-        pygame.draw.line(canvas, _MARK, points[4], points[5], self._pixels(0.008))
-        pygame.draw.circle(canvas, _MARK, points[4], self._pixels(0.012))
+        pygame.draw.line(canvas, WHITE, points[4], points[5], self._pixels(0.008))
+        pygame.draw.circle(canvas, WHITE, points[4], self._pixels(0.012))
         task = self._config.task
         if isinstance(task, FindGoal):
             goal = self._screen(batch.goals[[i]])[0]
@@ -132,9 +126,9 @@ class Renderer(Canvas):
             box = pygame.Rect(corner[0], corner[1], round(2 * reach), round(2 * reach))
             pygame.draw.rect(canvas, color, box, width=line)
         for k, color in enumerate(COLORS):
-            pygame.draw.circle(canvas, (255, 255, 255), targets[k], self._pixels(0.022))
+            pygame.draw.circle(canvas, WHITE, targets[k], self._pixels(0.022))
             pygame.draw.circle(canvas, color, targets[k], self._pixels(0.018), 2 * line)
-            pygame.draw.circle(canvas, (255, 255, 255), fingers[k], self._pixels(0.04))
+            pygame.draw.circle(canvas, WHITE, fingers[k], self._pixels(0.04))
             pygame.draw.circle(canvas, color, fingers[k], self._pixels(0.034))
 
     def _draw_lamp(self, canvas: "pygame.Surface", batch: SquareBatch, i: int) -> None:
@@ -143,7 +137,7 @@ class Renderer(Canvas):
         center = self._screen(np.array([[0.9, 0.9]]))[0]
         color = _HELD if batch.held[i] else _LOOSE
         pygame.draw.circle(canvas, color, center, self._pixels(0.055))
-        pygame.draw.circle(canvas, _BORDER, center, self._pixels(0.055), self._pixels(0.006))
+        pygame.draw.circle(canvas, BORDER, center, self._pixels(0.055), self._pixels(0.006))
         constants = batch.constants[i]
         weight = constants[kernels.WEIGHT]
         force = constants[kernels.FRICTION] * batch.presses[i].sum()
@@ -153,11 +147,9 @@ class Renderer(Canvas):
         width, height = 0.3 * self._scale, 0.035 * self._scale
         pygame.draw.rect(canvas, color, pygame.Rect(left, top, filled * width, height))
         frame = pygame.Rect(left, top, width, height)
-        pygame.draw.rect(canvas, _BORDER, frame, self._pixels(0.005))
+        pygame.draw.rect(canvas, BORDER, frame, self._pixels(0.005))
         middle = left + width / 2.0
-        pygame.draw.line(
-            canvas, _BORDER, (middle, top), (middle, top + height), self._pixels(0.005)
-        )
+        pygame.draw.line(canvas, BORDER, (middle, top), (middle, top + height), self._pixels(0.005))
 
     def _draw_text(self, canvas: "pygame.Surface", batch: SquareBatch, i: int) -> None:
         import pygame

@@ -12,16 +12,12 @@ from flowpolicy_envs.tunnel.kernels import LINE, SPLINE
 if TYPE_CHECKING:
     import pygame
 
-_BORDER = (60, 60, 60)
 _WALL = (214, 39, 40)
 _GOAL = (120, 200, 120)
 _REACH = (170, 170, 170)
 _TRAIL = (150, 150, 150)
 _AGENT = (0, 0, 0)
 _SAMPLE = (31, 119, 220, 110)
-
-_MARGIN = 1.04
-"""Half the edge of the picture, in world units."""
 
 _LANE = 0.05
 """Half the width at which a one-dimensional world is drawn."""
@@ -47,7 +43,6 @@ class Renderer(Canvas):
     """
 
     caption = "Tunnel"
-    view = _MARGIN
 
     def __init__(self, config: TunnelConfig, size: int) -> None:
         super().__init__(size)
@@ -84,14 +79,9 @@ class Renderer(Canvas):
         pygame.draw.circle(canvas, _AGENT, (x, y), self._pixels(0.018))
 
     def _draw_background(self, canvas: "pygame.Surface") -> None:
-        import pygame
-
-        low, high = self._screen(np.array([[-1.0, 1.0], [1.0, -1.0]])).round()
-        world = pygame.Rect(*low, *(high - low))
-        canvas.set_clip(world)
+        canvas.set_clip(self._world())
         self._draw_tunnel(canvas)
         canvas.set_clip(None)
-        pygame.draw.rect(canvas, _BORDER, world, width=self._pixels(0.006))
 
     def _draw_tunnel(self, canvas: "pygame.Surface") -> None:
         config, path = self._config, self._config.geometry
