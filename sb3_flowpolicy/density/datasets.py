@@ -49,10 +49,10 @@ class TwoMoons:
     """Two interleaved half circles from scikit-learn's ``make_moons``.
 
     Args:
-        labelled: Whether the label of the moon, 0 or 1, is the condition.
+        labeled: Whether the label of the moon, 0 or 1, is the condition.
 
     Example:
-        >>> TwoMoons(labelled=True).draw(2000, seed=0).points.shape
+        >>> TwoMoons(labeled=True).draw(2000, seed=0).points.shape
         (2000, 2)
         >>> print(f"{TwoMoons().entropy():.3f} nats")
         0.289 nats
@@ -60,13 +60,13 @@ class TwoMoons:
 
     n_train = 2000
 
-    def __init__(self, labelled: bool = False) -> None:
-        self.labelled = labelled
-        self.condition_dim = int(labelled)
+    def __init__(self, labeled: bool = False) -> None:
+        self.labeled = labeled
+        self.condition_dim = int(labeled)
 
     def conditions(self, n: int) -> np.ndarray:
         """Return the conditions whose densities are integrated, (K, C)."""
-        return np.array([[0.0], [1.0]]) if self.labelled else np.zeros((1, 0))
+        return np.array([[0.0], [1.0]]) if self.labeled else np.zeros((1, 0))
 
     def draw(self, n: int, seed: int) -> Sample:
         """Draw n points, half of them from each moon."""
@@ -82,7 +82,7 @@ class TwoMoons:
         upper = moon_log_density(sample.points)
         # A rotation by 180 degrees around (0.5, 0.25) maps one moon to the other.
         lower = moon_log_density(np.array([1.0, 0.5]) - sample.points)
-        if self.labelled:
+        if self.labeled:
             return np.where(sample.condition[:, 0] > 0.5, lower, upper)
         return np.logaddexp(upper, lower) - np.log(2)
 

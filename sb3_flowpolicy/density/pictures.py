@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Seed of the noise and of the new points.
 PICTURE_SEED = 7
-BLUE, ORANGE, GREY = "#1f6fb4", "#d9662b", "#555555"
+BLUE, ORANGE, GRAY = "#1f6fb4", "#d9662b", "#555555"
 # Model -> its label and its color.
 STYLES = {
     "realnvp": ("RealNVP (ours)", BLUE),
@@ -57,7 +57,7 @@ def draw_two_moons(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     for kind in ("samples", "density"):
         figure, panels = _grid_of_panels(len(fits) + 2, 4)
         _draw_density(panels[0], truth, MOONS_EXTENT, "true density")
-        _draw_points(panels[1], scaler.apply(train.points), MOONS_EXTENT, "training data", GREY)
+        _draw_points(panels[1], scaler.apply(train.points), MOONS_EXTENT, "training data", GRAY)
         for axes, fitted in zip(panels[2:], fits, strict=True):
             model, label = fitted.middle_model(), STYLES[fitted.model][0]
             if kind == "samples":
@@ -111,7 +111,7 @@ def _layers_figure(model: FlowModel) -> Figure:
 def draw_label(fits: Sequence[Fitted], folder: Path, scale: Scale) -> None:
     """Draw samples of both labels (2.7), and the probability of each label."""
     (fitted,) = fits
-    data, model = TwoMoons(labelled=True), fitted.middle_model()
+    data, model = TwoMoons(labeled=True), fitted.middle_model()
     scaler, train = fitted.middle_data(data)
     colors = np.where(train.condition[:, 0] > 0.5, ORANGE, BLUE)
     figure, panels = _grid_of_panels(3, 3, size=2.8)

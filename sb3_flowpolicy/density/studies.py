@@ -62,7 +62,7 @@ _STUDIES = (
         name="two-moons-label",
         claim="D2",
         title="One flow, two shapes: the moon's label as condition (thesis 2.1.3, Fig. 2.7)",
-        data=lambda: TwoMoons(labelled=True),
+        data=lambda: TwoMoons(labeled=True),
         epochs={"realnvp": 250},
         thesis="The NLL reaches 0.5 nats within 250 epochs, less than half of the best "
         "unconditional flow's. The samples look like the data. Comparing the likelihoods of a "

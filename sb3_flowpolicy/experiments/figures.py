@@ -110,7 +110,7 @@ def profile_figure(evidence: Evidence) -> Figure | None:
     for axes, profiles in zip(column, found.values(), strict=True):
         for agent, profile in profiles:
             draw_seeds(axes, profile, agent.color, agent.label)
-        axes.set_xlabel("share of the way from start to goal, on the centre line", fontsize=8)
+        axes.set_xlabel("share of the way from start to goal, on the center line", fontsize=8)
         axes.set_ylabel("entropy (nats)", fontsize=8)
         _style(axes)
         axes.legend(fontsize=8, frameon=False)
@@ -202,15 +202,14 @@ def policies_figure(evidence: Evidence) -> Figure | None:
 def _draw_tunnel(axes: Axes, env: Any) -> None:
     config = env.config
     path = config.geometry
-    low, high = path.ends
-    centre = path.polyline(low, high)
-    along = np.gradient(centre, axis=0)
+    center = path.polyline(*path.ends)
+    along = np.gradient(center, axis=0)
     across = np.column_stack([-along[:, 1], along[:, 0]])
     across *= config.width / 2 / np.linalg.norm(across, axis=1, keepdims=True)
     goal = path.polyline(*path.goal_arcs)
     axes.plot(*goal.T, color=_GOAL, linewidth=5, solid_capstyle="butt")
     for side in (-1, 1):
-        axes.plot(*(centre + side * across).T, color=_WALL, linewidth=0.7)
+        axes.plot(*(center + side * across).T, color=_WALL, linewidth=0.7)
 
 
 def _draw_policy(axes: Axes, env: Any, picture: dict[str, Any], k: int) -> None:

@@ -18,11 +18,11 @@ from sb3_flowpolicy.density.datasets import (
     moon_log_density,
 )
 
-DATA_SETS = {"moons": TwoMoons(), "label": TwoMoons(labelled=True), "angle": AngleMoons()}
+DATA_SETS = {"moons": TwoMoons(), "label": TwoMoons(labeled=True), "angle": AngleMoons()}
 
 
 def test_two_moons_are_scikit_learns() -> None:
-    sample = TwoMoons(labelled=True).draw(2000, seed=3)
+    sample = TwoMoons(labeled=True).draw(2000, seed=3)
     points, label = make_moons(2000, noise=0.05, random_state=3)
     np.testing.assert_array_equal(sample.points, points)
     np.testing.assert_array_equal(sample.condition[:, 0], label)
@@ -73,15 +73,15 @@ def test_entropy_is_the_mean_surprise_of_samples(data: DataSet) -> None:
 
 def test_two_moons_hardly_overlap() -> None:
     assert TwoMoons().entropy() == pytest.approx(
-        TwoMoons(labelled=True).entropy() + np.log(2), abs=1e-3
+        TwoMoons(labeled=True).entropy() + np.log(2), abs=1e-3
     )
 
 
 def test_density_of_one_moon_follows_from_the_other() -> None:
     points = np.random.default_rng(0).normal(size=(50, 2))
-    labelled = TwoMoons(labelled=True)
-    upper = labelled.log_density(Sample(points, np.zeros((50, 1))))
-    lower = labelled.log_density(Sample(points, np.ones((50, 1))))
+    labeled = TwoMoons(labeled=True)
+    upper = labeled.log_density(Sample(points, np.zeros((50, 1))))
+    lower = labeled.log_density(Sample(points, np.ones((50, 1))))
     np.testing.assert_allclose(
         TwoMoons().log_density(Sample(points, np.zeros((50, 0)))),
         np.log(0.5 * np.exp(upper) + 0.5 * np.exp(lower)),
@@ -112,10 +112,10 @@ def test_moon_density_converged_in_its_nodes() -> None:
 
 def test_entropy_of_a_gaussian_mixture() -> None:
     """Two normals far apart: the entropy of one, plus log 2."""
-    scale, centres = np.array([0.3, 0.5]), np.array([[-4.0, 0.0], [4.0, 1.0]])
+    scale, centers = np.array([0.3, 0.5]), np.array([[-4.0, 0.0], [4.0, 1.0]])
 
     def log_density(points: np.ndarray) -> np.ndarray:
-        z = (points[:, None] - centres) / scale
+        z = (points[:, None] - centers) / scale
         single = -0.5 * (z**2).sum(-1) - np.log(2 * np.pi * scale.prod())
         return np.logaddexp(single[:, 0], single[:, 1]) - np.log(2)
 

@@ -44,7 +44,7 @@ class World:
             *self._rest,
         )
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def randomize(self, rng: np.random.Generator) -> None:
         """Any pose, speeds far above those of episodes, fingers anywhere outside the square."""
         self.body[:] = rng.uniform(-1, 1, 6) * (0.3, 0.3, np.pi, 3.0, 3.0, 10.0)
         self.targets[:] = PLACES + rng.uniform(-0.4, 0.4, (4, 2))
@@ -80,7 +80,7 @@ def test_contact_never_creates_energy(rules):
     world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]] = 0.0
     touched = 0
     for _ in range(1500):
-        world.randomise(rng)
+        world.randomize(rng)
         for _ in range(40):
             before = world.kinetic_energy()
             world.substep()
@@ -95,7 +95,7 @@ def test_controllers_release_no_more_than_they_stored(rules):
     rng, world = np.random.default_rng(1), World(**rules)
     world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]] = 0.0
     for _ in range(1500):
-        world.randomise(rng)
+        world.randomize(rng)
         for _ in range(60):
             before = world.kinetic_energy() + world.stored_energy()
             world.substep()
@@ -109,7 +109,7 @@ def test_momentum_changes_by_contact_forces_and_damping(rules):
     mass, inertia = world.constants[[kernels.MASS, kernels.INERTIA]]
     linear, angular = world.constants[[kernels.LINEAR_DAMPING, kernels.ANGULAR_DAMPING]]
     for _ in range(300):
-        world.randomise(rng)
+        world.randomize(rng)
         for _ in range(20):
             old, arms = world.body.copy(), world.fingers - world.body[:2]
             world.substep()
@@ -150,7 +150,7 @@ def test_fingers_feel_the_reaction():
 def test_fingers_stay_outside(rules):
     rng, world = np.random.default_rng(3), World(**rules)
     for _ in range(300):
-        world.randomise(rng)
+        world.randomize(rng)
         for _ in range(60):
             world.substep()
             # At a corner, a finger may slip in by what a fast square moves in a substep.
