@@ -132,10 +132,6 @@ class DeterministicEpisodes:
             running &= ~ended
         return returns, success
 
-    def close(self) -> None:
-        """Close the environments."""
-        self.venv.close()
-
 
 def entropy_profile(model: SACFlow, env_id: str, seed: int) -> dict[str, list[float]]:
     """Estimate the entropy at points of a Tunnel's center line from start to goal.

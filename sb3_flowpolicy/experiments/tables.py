@@ -42,7 +42,6 @@ def results_table(evidence: Evidence) -> pd.DataFrame:
     rows = []
     for setting, agent in evidence.measured:
         pair, metrics = (setting.name, agent.name), evidence.columns(setting.name, agent.name)
-        finals = {name: evidence.final(*pair, name) for name in metrics}
         row = {"setting": setting.name, "agent": agent.label, "seeds": ""}
         if "test_success" in metrics:
             solved, once = evidence.solved(*pair), evidence.solved_once(*pair)
@@ -53,7 +52,8 @@ def results_table(evidence: Evidence) -> pd.DataFrame:
                 likely = evidence.solved(*pair, "log_prob_success")
                 row["by the most likely action"] = f"{likely.sum()} of {len(likely)}"
             row["steps until solved"] = f"{steps:,.0f}" if once.any() else "never"
-        for name, final in finals.items():
+        for name in metrics:
+            final = evidence.final(*pair, name)
             row["seeds"] = str(len(final))
             row[WORDS[name]] = in_digits(name, interquartile_mean(final))
         rows.append(row)

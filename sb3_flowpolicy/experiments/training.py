@@ -138,7 +138,7 @@ class _Training:
             self._tell(group, stage)
         if "profile" in item.measures:
             self._record("profile", measures.entropy_profile, models)
-        tests.close()
+        tests.venv.close()
         if group == 0:
             # Kept to draw pictures of it; saved before the item is declared complete.
             self.files.agent.parent.mkdir(exist_ok=True)
