@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_flowpolicy.common.command_line import assignment, check_folder_of, run
+from sb3_flowpolicy.experiments.coordination.families import FAMILIES
 
 _DESCRIPTION = """\
 Predict, without training, how much an agent gains from noise that correlates between fingers.
@@ -62,9 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--task", metavar="TERM=VALUE", help="coefficients of the reward", **pairs)
     add("--ent-coef", type=float, default=0.05, help="entropy coefficient (default: 0.05)")
     add("--gamma", type=float, default=0.9, help="discount factor (default: 0.9)")
-    known = ("independent", "pink", "rank 2", "full")
-    some = f"some of {', '.join(map(repr, known))} (default: all)"
-    add("--families", nargs="+", choices=known, default=known, metavar="NAME", help=some)
+    some = f"some of {', '.join(map(repr, FAMILIES))} (default: all)"
+    add("--families", nargs="+", choices=FAMILIES, default=FAMILIES, metavar="NAME", help=some)
     add("--budget", type=int, default=800, help="candidates per family (default: 800)")
     add("--episodes", type=int, default=48, help="episodes per candidate (default: 48)")
     add("--seed", type=int, default=0, help="seed of the search (default: 0)")
