@@ -92,6 +92,7 @@ def predict(
     for name in ("independent", *(name for name in names if name != "independent")):
         family = FAMILIES[name]
         begin = np.concatenate([start[:2], family.start(start[2:])])
+        # For cma, seed 0 is the clock.
         options = {"seed": setting.seed + 1, "verbose": -9, "maxfevals": setting.budget}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # cma's, about options that it changes itself
