@@ -46,7 +46,7 @@ TUNNEL_IDS: dict[str, dict[str, Any]] = {
 }
 """The Tunnel ids and the arguments in which they differ from `Tunnel-v0`."""
 
-_MAX_EPISODE_STEPS = {"TunnelSpline-v0": 60}
+_TUNNEL_STEPS = {"TunnelSpline-v0": 60}
 """The spline is three times as long as the way along the circle: 40 steps would be tight."""
 
 _MOVE: dict[str, Any] = {"max_force": 1.95, "warm_up": 4.0}
@@ -101,7 +101,7 @@ def register_envs() -> None:
         40
     """
     for env_id, kwargs in TUNNEL_IDS.items():
-        _register("tunnel", "Tunnel", env_id, _MAX_EPISODE_STEPS.get(env_id, 40), kwargs)
+        _register("tunnel", "Tunnel", env_id, _TUNNEL_STEPS.get(env_id, 40), kwargs)
     for env_id, kwargs in SQUARE_IDS.items():
         _register("square", "Square", env_id, _SQUARE_STEPS.get(env_id, 80), kwargs)
 

@@ -52,7 +52,7 @@ def run_on_ray(
     # On the runner's machine, which is the only one that must not be lost.
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     reports = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
-    task = ray.remote(_run_away).options(
+    task = ray.remote(_run_remotely).options(
         num_cpus=1, max_retries=MOST_RETRIES, runtime_env=environment
     )
     waiting = {task.remote(item, reports): item for item in items}
@@ -82,7 +82,7 @@ def run_on_ray(
         reports.shutdown(force=True)
 
 
-def _run_away(item: WorkItem, reports: Any) -> dict[str, bytes]:
+def _run_remotely(item: WorkItem, reports: Any) -> dict[str, bytes]:
     """Do an item on another machine, and return its files."""
     from sb3_flowpolicy.experiments.training import run_item
 

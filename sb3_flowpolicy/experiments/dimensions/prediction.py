@@ -141,8 +141,8 @@ def _widest(
     low, high = math.log(1e-4), math.log(0.88)
     for _ in range(18):
         middle = (low + high) / 2.0
-        survives = survival_of(np.tanh(shared + math.exp(middle) * own), width) >= survival
-        low, high = (middle, high) if survives else (low, middle)
+        enough = survival_of(np.tanh(shared + math.exp(middle) * own), width) >= survival
+        low, high = (middle, high) if enough else (low, middle)
     return math.exp(low)
 
 
