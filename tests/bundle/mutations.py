@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,16 @@ HOSTILE: list[Any] = [
     *({"layers": 10**9}, {"hidden": [10**6] * 3}, {"hidden": [1] * 9000}, {"rank": 2}, {"x": None}),
     *({"schedule": "linear", "start": 1e-3, "end": 0.0, "end_fraction": 1}, [1, "step"], [[[[0]]]]),
 ]
+
+
+class Evil:
+    """Unpickling this writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
 
 
 def places(tree: Any, where: tuple = ()) -> list[tuple]:

@@ -16,6 +16,7 @@ import safetensors.numpy
 from sb3_flowpolicy import BundleError, SACFlow
 from sb3_flowpolicy.bundle.container import MAX_HEADER_BYTES
 from tests.bundle.conftest import make_model, parts_of, sealed
+from tests.bundle.mutations import Evil
 
 Change = Callable[[Any, dict[str, np.ndarray]], None]
 
@@ -138,16 +139,6 @@ def test_messages_about_damaged_files(bundle: Path, tmp_path: Path) -> None:
     safetensors.numpy.save_file({"x": np.ones(3)}, path, {"format": "np"})
     with pytest.raises(BundleError, match="KeyError: 'sb3_flowpolicy'"):
         SACFlow.load_safe(path)
-
-
-class Evil:
-    """Unpickling this writes a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.path,)
 
 
 def test_pickles_are_not_opened_as_such(bundle: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as npst
 from sb3_flowpolicy.algorithms.demonstrations import KEYS, load_demonstrations
 from sb3_flowpolicy.common.files import read_json
 from sb3_flowpolicy.experiments.store import BASIC_COLUMNS, ItemFiles
-from tests.bundle.mutations import by_chance
+from tests.bundle.mutations import Evil, by_chance
 from tests.fuzz.effort import fuzz
 from tests.fuzz.test_configuration import ANYTHING, works_or_says_why
 
@@ -74,14 +74,6 @@ def load(tmp_path: Path) -> dict[str, np.ndarray]:
 @given(source=ANYTHING | st.dictionaries(st.sampled_from(KEYS), ANYTHING))
 def test_demonstrations_that_are_no_file(source: Any) -> None:
     assert_plain(works_or_says_why(load_demonstrations, source))
-
-
-class Evil:
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.path,)
 
 
 def test_demonstrations_are_never_unpickled(tmp_path: Path) -> None:
