@@ -32,11 +32,12 @@ def test_gymnasiums_checker_passes(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_stable_baselines3s_checker_passes(env_id):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    from stable_baselines3.common import env_checker
+
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", ".*is out of date")  # ids of an earlier version
-        checker.check_env(gym.make(env_id, render_mode="rgb_array"))
+        env_checker.check_env(gym.make(env_id, render_mode="rgb_array"))
 
 
 def rollout(env: gym.Env, steps: int, rng: np.random.Generator) -> list[tuple]:

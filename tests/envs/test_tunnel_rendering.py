@@ -109,7 +109,8 @@ def test_rendering_needs_no_display():
 
 
 def test_human_mode_opens_and_closes_a_window():
-    pygame = pytest.importorskip("pygame")
+    import pygame
+
     env = TunnelEnv(render_mode="human", render_size=64)
     env.reset()
     env.step([1.0, 1.0])

@@ -138,7 +138,6 @@ def test_correlated_noise_finds_the_goal_up_to_four_dimensions():
 
 @pytest.mark.parametrize("results", [True, False])
 def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("matplotlib")
     monkeypatch.setattr(
         "sb3_flowpolicy.experiments.dimensions.__main__.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
     )
@@ -155,7 +154,6 @@ def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch, caps
 
 
 def test_the_command_writes_what_it_prints(tmp_path, capsys, monkeypatch):
-    pytest.importorskip("matplotlib")
     monkeypatch.setattr(
         "sb3_flowpolicy.experiments.dimensions.__main__.WIDTHS", {2: WIDTHS[2], 3: WIDTHS[3]}
     )

@@ -117,7 +117,7 @@ def test_three_times_the_bar_reaches_the_bar(make_up: MakeUp, tmp_path: Path) ->
     assert evidence.steps_until_solved("narrow", "flow").tolist() == [1500, 1500]
 
 
-def test_who_learns_nothing_is_not_steady(make_up: MakeUp, tmp_path: Path) -> None:
+def test_seeds_that_learn_nothing_are_not_steady(make_up: MakeUp, tmp_path: Path) -> None:
     make_up(NAME, {"flow": 0.0})
     _, findings = Evidence(EXPERIMENTS[NAME], tmp_path / NAME).judge()
     assert [finding.holds for finding in findings] == [False, True, False]

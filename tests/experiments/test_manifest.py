@@ -12,10 +12,7 @@ import pytest
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
 from sb3_flowpolicy.experiments.experiment import Experiment
 from sb3_flowpolicy.experiments.manifest import EXPERIMENTS, what_is_missing
-from sb3_flowpolicy.experiments.work import (
-    environment,
-    make_plan,
-)
+from sb3_flowpolicy.experiments.work import environment, make_plan
 
 
 def test_all_claims_are_there() -> None:

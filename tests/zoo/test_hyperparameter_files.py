@@ -3,10 +3,10 @@
 from copy import deepcopy
 
 import pytest
+import yaml
 
+from flowpolicy_envs.registration import SQUARE_IDS, TUNNEL_IDS
 from sb3_flowpolicy.zoo import ALGORITHMS, hyperparameter_file
-
-yaml = pytest.importorskip("yaml")
 
 SAC = {"sac_flow": "FlowPolicy", "sac_lowrank": "LowRankPolicy", "sac_gauss": "GaussPolicy"}
 PPO = {"ppo_flow": "FlowPolicy", "ppo_lowrank": "LowRankPolicy"}
@@ -57,9 +57,7 @@ def test_every_block_is_ready_to_run(algorithm):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_environment_of_ours_has_a_block(algorithm):
-    registration = pytest.importorskip("flowpolicy_envs.registration")
-    ours = {*registration.TUNNEL_IDS, *registration.SQUARE_IDS, *BULLET}
-    assert ours <= set(blocks(algorithm))
+    assert {*TUNNEL_IDS, *SQUARE_IDS, *BULLET} <= set(blocks(algorithm))
 
 
 def test_small_networks_of_section_3_2_4():

@@ -5,8 +5,6 @@ import sys
 
 import pytest
 
-SCRIPTS = pytest.mark.parametrize("script", ["train", "enjoy", "record_video"])
-
 
 @pytest.fixture
 def launch(monkeypatch):
@@ -22,7 +20,7 @@ def launch(monkeypatch):
     return run
 
 
-@SCRIPTS
+@pytest.mark.parametrize("script", ["train", "enjoy", "record_video"])
 def test_it_runs_the_script_of_rl_zoo3_with_our_algorithms(script, launch, capsys):
     pytest.importorskip("rl_zoo3")
     with pytest.raises(SystemExit) as exit_:
