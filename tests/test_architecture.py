@@ -91,10 +91,6 @@ def test_every_package_has_its_floor() -> None:
     ("statement", "unwanted"),
     [
         ("import sb3_flowpolicy", ["torch", "stable_baselines3", "numpy"]),
-        (
-            "import flowpolicy_envs",
-            ["torch", "stable_baselines3", "sb3_flowpolicy", "pygame", "numba"],
-        ),
         ("import sb3_flowpolicy.distributions", ["stable_baselines3", "gymnasium"]),
     ],
 )

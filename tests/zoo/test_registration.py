@@ -35,12 +35,6 @@ def test_algorithms():
     assert not {ALGOS[name] for name in classes} & set(classes.values())
 
 
-def test_environments():
-    import gymnasium
-
-    assert ENV_ID in gymnasium.registry
-
-
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("options", [{}, {"config": None}])
 def test_our_file_is_the_default(algorithm, options, tmp_path):
