@@ -138,7 +138,7 @@ class BatchVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], np.ndar
         if some_ended and mode is AutoresetMode.DISABLED:
             raise ResetNeeded(
                 f"autoreset_mode is Disabled, so agents {np.flatnonzero(ended).tolist()} must be "
-                f"reset before the next step"
+                "reset before the next step"
             )
         agents.step(actions, ~ended if some_ended else None, self._generator)
         self._steps += 1

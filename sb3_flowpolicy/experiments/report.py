@@ -45,7 +45,7 @@ makes one page from them.
 METHOD = (
     "Every seed is drawn and counted; none is dropped. Numbers are interquartile means over seeds "
     f"with 95 % bootstrap intervals in brackets (percentiles of {RESAMPLES} resamples). "
-    f"Test episodes are deterministic, at least ten per seed and measurement; on a tunnel, whose "
+    "Test episodes are deterministic, at least ten per seed and measurement; on a tunnel, whose "
     "start is fixed, they are all the same episode. They use the mean, of a flow the image of the "
     "base mean, and 'most likely action' stands for `deterministic_mode=\"log_prob\"` instead. "
     "Training numbers average the episodes that ended since the last measurement, entropies 256 "
@@ -54,7 +54,7 @@ METHOD = (
     f"least {definitions.FINAL_LEAST}. A seed has solved its task 'at the end' if its final test "
     f"success is at least {definitions.SOLVED:.0%}, 'at its best' if {definitions.IN_A_ROW} "
     "measurements in a row average that; a seed that never does counts with the length of "
-    f"training in 'steps until solved'. Oscillations are counted as swings of at least "
+    "training in 'steps until solved'. Oscillations are counted as swings of at least "
     f"{definitions.OSCILLATIONS['train_return']:.0%} of the highest test return in training "
     f"return, {definitions.OSCILLATIONS['entropy']:g} nats in entropy and "
     f"{definitions.OSCILLATIONS['log_ent_coef']:g} in the logarithm of the entropy coefficient, "

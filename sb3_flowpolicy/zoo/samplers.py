@@ -85,7 +85,7 @@ def _configured_policy_kwargs(trial: "optuna.Trial") -> dict[str, Any]:
         return ast.literal_eval(text)
     except (SyntaxError, ValueError):
         warnings.warn(
-            f"policy_kwargs must be plain numbers, strings and lists to be kept while "
+            "policy_kwargs must be plain numbers, strings and lists to be kept while "
             f"tuning, got {text}: only the sampled ones are used",
             stacklevel=2,
         )

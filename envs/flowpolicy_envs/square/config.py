@@ -140,7 +140,7 @@ class SquareConfig:
         settling = self.dt * high["kp"] / (low["kd"] + low["finger_damping"])
         if settling > 1.0:
             raise ValueError(
-                f"dt * kp / (kd + finger_damping) must be at most 1 for the controller to settle, "
+                "dt * kp / (kd + finger_damping) must be at most 1 for the controller to settle, "
                 f"got {settling:.3g}"
             )
         # The mobility of a corner that is pushed along the normal of a face.

@@ -73,7 +73,7 @@ class TunnelConfig:
         to_goal = self.geometry.locate(self.geometry.point(0.0))[1]
         if self.start_noise >= to_goal:
             raise ValueError(
-                f"start_noise must be less than the path's length to the goal region, "
+                "start_noise must be less than the path's length to the goal region, "
                 f"{to_goal:.4g}, got {self.start_noise}"
             )
 
