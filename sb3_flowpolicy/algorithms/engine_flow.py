@@ -47,9 +47,13 @@ from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
 from sb3_flowpolicy.engine.replay import COLUMNS, is_plain
 from sb3_flowpolicy.engine.update import Objective
 from sb3_flowpolicy.guard import NonFiniteError, TrainingGuard
-from sb3_flowpolicy.guard.finite import check_experience, check_observation, check_step
+from sb3_flowpolicy.guard.finite import (
+    check_experience,
+    check_finite,
+    check_observation,
+    check_step,
+)
 from sb3_flowpolicy.policies import FlowActor
-from sb3_flowpolicy.policies.base import check_finite
 from sb3_flowpolicy.policies.off_policy import DistributionPolicy
 
 if TYPE_CHECKING:

@@ -20,8 +20,7 @@ from sb3_flowpolicy.engine.ppo_update import (
     policy_function,
 )
 from sb3_flowpolicy.engine.runtime import BoundEngine, Place, why_network_unsupported
-from sb3_flowpolicy.guard.finite import NonFiniteError
-from sb3_flowpolicy.policies.base import check_finite
+from sb3_flowpolicy.guard.finite import NonFiniteError, check_finite
 from sb3_flowpolicy.policies.on_policy import DensityActorCritic
 
 

@@ -32,6 +32,14 @@ def all_finite(values: np.ndarray) -> bool:
         return bool(np.isfinite(values.astype(np.float32)).all())
 
 
+def check_finite(values: np.ndarray, name: str = "actions") -> None:
+    """Raise :class:`NonFiniteError` rather than send NaN to an environment or learn from it."""
+    if not all_finite(values):
+        raise NonFiniteError(
+            f"observation and weights must be finite, got {name} with NaN or infinity"
+        )
+
+
 def check_observation(observation: Any) -> None:
     """Raise :class:`NonFiniteError` if an observation to act on is not finite."""
     _check("observation", observation, lambda at: f"at index {at}")

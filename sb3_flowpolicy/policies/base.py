@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import (
 )
 
 from sb3_flowpolicy.common.validation import layer_sizes, mapping, optional
-from sb3_flowpolicy.guard.finite import NonFiniteError, all_finite, check_observation
+from sb3_flowpolicy.guard.finite import check_finite, check_observation
 
 _FORMS = {"Cnn": ("image", NatureCNN), "MultiInput": ("dictionary", CombinedExtractor)}
 
@@ -108,14 +108,6 @@ def check_net_arch(net_arch: Any, required: set[str], allowed: set[str]) -> None
             layer_sizes("net_arch", arch)
     elif net_arch is not None:
         layer_sizes("net_arch", net_arch)
-
-
-def check_finite(values: np.ndarray, name: str = "actions") -> None:
-    """Raise :class:`NonFiniteError` rather than send NaN to an environment or learn from it."""
-    if not all_finite(values):
-        raise NonFiniteError(
-            f"observation and weights must be finite, got {name} with NaN or infinity"
-        )
 
 
 def with_forms(**policies: type[BasePolicy]) -> dict[str, Any]:

@@ -17,10 +17,10 @@ from sb3_flowpolicy.common.validation import flag, number
 from sb3_flowpolicy.distributions import ActionDistribution, TanhSquashed, make_distribution
 from sb3_flowpolicy.distributions.gaussian import LogStdHead
 from sb3_flowpolicy.distributions.loc_scale import StateIndependent, with_heads
+from sb3_flowpolicy.guard.finite import check_finite
 from sb3_flowpolicy.policies.base import (
     DensityPolicy,
     check_action_space,
-    check_finite,
     check_net_arch,
     with_forms,
 )
