@@ -76,7 +76,10 @@ class StackedNetworks:
             normalize: Applies layers other than linear ones: given a layer's name, the layer, all
                 parameters, and its input, it returns the output.
         """
-        hidden = self._critic_inputs(obs, actions)
+        rows = self.observations.unpack(obs.flatten(0, 1))
+        features = self._critic.extract_features(rows, self._critic.features_extractor)
+        features = features.unflatten(0, obs.shape[:2])
+        hidden = th.cat([features, actions], dim=-1).unsqueeze(1)
         parameters = self.critic.unflatten(critic)
         with th.autocast(obs.device.type, th.bfloat16, enabled=self.autocast):
             for name, layer in self._critic.q_networks[0].named_children():
@@ -88,14 +91,6 @@ class StackedNetworks:
                 else:
                     hidden = layer(hidden)
         return hidden.to(critic.dtype)
-
-    def _critic_inputs(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Return features and actions side by side, (S, 1, B, F)."""
-        extractor = self._critic.features_extractor
-        rows = self.observations.unpack(obs.flatten(0, 1))
-        features = self._critic.extract_features(rows, extractor)
-        features = features.unflatten(0, obs.shape[:2])
-        return th.cat([features, actions], dim=-1).unsqueeze(1)
 
 
 def per_seed(function: Callable[..., Any], *arguments: Any) -> Any:
