@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,5 +42,7 @@ class Observations:
         if not self.shapes:
             return rows
         parts = rows.split(self._widths, dim=1)
-        named: Mapping[str, th.Tensor] = dict(zip(self.shapes, parts, strict=True))
-        return {name: part.unflatten(1, self.shapes[name]) for name, part in named.items()}
+        return {
+            name: part.unflatten(1, shape)
+            for (name, shape), part in zip(self.shapes.items(), parts, strict=True)
+        }
