@@ -279,4 +279,4 @@ def _places(model: Any) -> list[Place]:
 
 
 def _has_tensors(module: th.nn.Module) -> bool:
-    return any(True for _ in (*module.parameters(), *module.buffers()))
+    return bool([*module.parameters(), *module.buffers()])

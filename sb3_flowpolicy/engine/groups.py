@@ -27,7 +27,7 @@ def seeds_at_once(critic: Any, n_seeds: int, batch_size: int) -> int:
         (2, 1)
     """
     weights = [layer.weight for layer in critic.modules() if isinstance(layer, nn.Linear)]
-    if not weights or weights[0].device != th.device("cpu"):
+    if weights[0].device != th.device("cpu"):
         return n_seeds
     widest = max(len(weight) for weight in weights)
     per_seed = widest * len(critic.q_networks) * batch_size * weights[0].element_size()
