@@ -71,12 +71,12 @@ class RunCheckpoints:
             if path is not None and every is not None:
                 self.start(path, every)
             yield
+            run = self._run()
             if self._late is not None:
                 # This call had ended before the run was interrupted, and its logs must show that;
                 # the next call is the one to resume.
-                self._begun = self._run().first._total_timesteps
-                state.restore_late(self._run(), self._late)
-            run = self._run()
+                self._begun = run.first._total_timesteps
+                state.restore_late(run, self._late)
             reached = run.first.num_timesteps >= run.first._total_timesteps
             # A callback that stops learning does so in the middle of a rollout, where resuming
             # could not be exact.
