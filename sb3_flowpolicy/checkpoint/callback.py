@@ -54,7 +54,7 @@ class RunCheckpointCallback(BaseCallback):
         return True
 
 
-def _resume_in_place(model: Any, checkpoints: RunCheckpoints, path: str | Path) -> None:
+def _resume_in_place(model: Any, checkpoints: RunCheckpoints, path: Path) -> None:
     """Turn a new model into the agent of the newest checkpoint, during the setup of ``learn``."""
     checkpoint = open_checkpoint(path, type(model).__name__)
     check_same_build(model.env, checkpoint.manifest["layers"]["model"])

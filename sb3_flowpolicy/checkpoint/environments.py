@@ -11,8 +11,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvWrapper
 # How an environment was made, and open files; steps do not change these.
 _NOT_STATE = {"class_attributes", "env_fns", "spec", "_cached_spec", "results_writer"}
 
-LayerStates = dict[str, dict[str, Any]]
-
 
 def layers(env: Any) -> dict[str, Any]:
     """Name the wrappers and environments that an environment consists of, from the outside in.
@@ -50,7 +48,7 @@ def _origin(layer: Any) -> str:
     return f"({', '.join([spec.id, *(f'{key}={value}' for key, value in plain.items())])})"
 
 
-def layer_states(env: Any, outside_only: bool = False) -> LayerStates:
+def layer_states(env: Any, outside_only: bool = False) -> dict[str, dict[str, Any]]:
     """Collect what steps may change in every layer, without copying.
 
     ``outside_only`` omits what is inside of SB3's wrappers, which may be impossible to pickle.

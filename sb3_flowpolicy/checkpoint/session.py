@@ -230,7 +230,7 @@ def load_agent(
     checkpoint: Checkpoint,
     name: str,
     env: Any,
-    device: th.device | str = "auto",
+    device: th.device | str,
 ) -> Any:
     """Load an agent of a checkpoint, with an environment that is built as its own was."""
     check_same_build(env, checkpoint.manifest["layers"][name])

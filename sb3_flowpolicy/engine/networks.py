@@ -27,7 +27,7 @@ class StackedNetworks:
     products run in bfloat16; parameters and results stay as they are.
     """
 
-    def __init__(self, policies: Sequence[Any], autocast: bool = False) -> None:
+    def __init__(self, policies: Sequence[Any], autocast: bool) -> None:
         first = policies[0]
         assert isinstance(first.actor, FlowActor)
         self.autocast = autocast

@@ -27,7 +27,7 @@ from sb3_flowpolicy.policies.on_policy import DensityActorCritic
 class PPOEngine(BoundEngine):
     """Acts with and updates the policy of one PPOFlow model."""
 
-    def __init__(self, models: Sequence[PPO], compiled: bool = True) -> None:
+    def __init__(self, models: Sequence[PPO], compiled: bool = False) -> None:
         super().__init__(models, compiled)
         (model,) = models
         policy = model.policy
