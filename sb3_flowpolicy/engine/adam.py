@@ -12,7 +12,7 @@ from sb3_flowpolicy.engine.flat import FlatParameters
 
 @dataclass(frozen=True)
 class AdamSettings:
-    """What distinguishes one Adam from another, apart from the learning rate."""
+    """Hyperparameters of Adam or AdamW, without the learning rate."""
 
     beta1: float
     beta2: float

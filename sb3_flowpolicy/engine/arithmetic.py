@@ -1,4 +1,4 @@
-"""How torch computes while models learn: the number of threads, and subnormal numbers."""
+"""Settings of torch while models learn: the number of threads, and flushing of subnormals."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def flushed_subnormals() -> Iterator[None]:
     A unit that is never active has gradients of 0. Adam's mean of them halves every seven updates,
     weight decay shrinks the unit's weights in the same way, and both end as subnormal numbers,
     which processors handle on a slow path: networks of 128 units slowed down to a tenth within 3000
-    updates (docs/engine.md). A program that has asked torch to flush them keeps that setting. Where
-    the processor cannot do it, nothing happens.
+    updates (docs/engine.md). If the program already flushes them, that setting stays. Where the
+    processor cannot do it, nothing happens.
 
     Example:
         >>> with flushed_subnormals():

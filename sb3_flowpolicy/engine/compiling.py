@@ -1,4 +1,4 @@
-"""How a function of tensors is compiled, and what happens where it cannot be."""
+"""Compile functions of tensors; run them eagerly where that fails."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ import torch as th
 class Compiled:
     """A function of tensors compiled into one graph per kind of call; its closure must not change.
 
-    Compilation happens at the first call, which says so: the SAC update takes 5 to 30 seconds,
-    less from the second run on, as torch caches it on disk. Where it fails, for want of a C++
-    compiler or of a feature of torch, the function runs eagerly from then on, with one warning.
+    The first call compiles and prints a message: the SAC update takes 5 to 30 seconds, less from
+    the second run on, as torch caches it on disk. If compiling fails because a C++ compiler or a
+    feature of torch is missing, the function runs eagerly from then on, with one warning.
     """
 
     def __init__(self, function: Callable[..., Any], name: str, device: th.device) -> None:

@@ -77,7 +77,7 @@ class CrossQObjective(SACObjective):
     def make_update(self, networks: Any, settings: UpdateSettings) -> Update:
         """Return sb3-contrib's ``CrossQ.train``, in its order: critics, entropy coefficient, actor.
 
-        The flag of an update says whether the last two are updated.
+        The flag of an update decides whether the last two are updated.
         """
 
         def update(

@@ -22,7 +22,7 @@ from sb3_flowpolicy.policies import FlowActor
 class Engine(BoundEngine):
     """Updates S models of SAC, TQC or CrossQ in lockstep.
 
-    Their method ``objective()`` says what they do with their critics.
+    Their method ``objective()`` returns how they use their critics.
     """
 
     def __init__(self, models: Sequence[Any], compiled: bool = False) -> None:

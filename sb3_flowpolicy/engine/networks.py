@@ -33,7 +33,7 @@ class StackedNetworks:
         self.autocast = autocast
         self.actor = FlatParameters([_actor_layout(policy) for policy in policies])
         self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies], True)
-        #: What an update changes besides: the target networks.
+        #: Further parameters that an update changes: those of the target networks.
         self.others = self._others(policies)
         self.noise_dim = first.actor.density.noise_dim
         self.observations = Observations(first.observation_space)

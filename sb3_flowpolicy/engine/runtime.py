@@ -115,7 +115,7 @@ EngineT = TypeVar("EngineT", bound=BoundEngine)
 
 
 class EngineRuntime(Generic[EngineT]):
-    """The engine of models that learn together.
+    """Provides the engine of models that learn together.
 
     Between :meth:`running` and its end the models' parameters and optimizer states are views of the
     engine's tensors. Callbacks may load parameters, reset optimizers, replace networks or change
@@ -145,7 +145,7 @@ class EngineRuntime(Generic[EngineT]):
 
     @property
     def compiles(self) -> bool:
-        """Whether the models' settings, and the number of planned updates, ask for compiling."""
+        """Whether to compile, by the models' settings and the number of planned updates."""
         wanted = self.models[0].compile
         if wanted != "auto":
             return bool(wanted)

@@ -131,7 +131,7 @@ def stack_losses(*losses: th.Tensor) -> th.Tensor:
 
 
 class Objective(ABC):
-    """What an algorithm makes of the critics' outputs, (S, C, B, Q): Q numbers per row and critic.
+    """How an algorithm uses the critics' outputs, (S, C, B, Q): Q numbers per row and critic.
 
     Objectives are compared by value, as their constants are compiled into the update.
     """
@@ -139,15 +139,15 @@ class Objective(ABC):
     name: ClassVar[str]
     """The algorithm's name, for messages."""
     critic_type: ClassVar[type[nn.Module]]
-    """The critics that it understands."""
+    """Class of the critics."""
     layer_types: ClassVar[tuple[type[nn.Module], ...]] = (nn.Linear,)
-    """Their layers that have parameters."""
+    """Types of the critics' layers that have parameters."""
     networks_type: ClassVar[type[StackedNetworks]] = StackedNetworks
-    """How they are evaluated."""
+    """Class of the functions that evaluate actor and critics."""
 
     @abstractmethod
     def next_values(self, outputs: th.Tensor) -> th.Tensor:
-        """Return what target critics say about the next observations, (S, B, T)."""
+        """Return the target critics' values of the next observations, (S, B, T)."""
 
     @abstractmethod
     def critic_loss(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
@@ -183,7 +183,7 @@ class Objective(ABC):
         r"""Return the function that performs one update of all seeds, in place.
 
         It is the ``train`` of SB3's SAC and sb3-contrib's TQC, in their order: entropy coefficient,
-        critics, actor, target networks. The objective says what V', L_Q and V are.
+        critics, actor, target networks. The objective defines V', L_Q and V.
 
         .. math::
             y &= r + \gamma (1 - d) (V'(Q^{target}(s', a')) - \alpha \log \pi(a' | s')) \\
