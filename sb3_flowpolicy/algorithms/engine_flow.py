@@ -135,9 +135,9 @@ class EngineFlow(OffPolicyAlgorithm):
         super().__init__(*args, **kwargs)
 
     def objective(self) -> Objective | None:
-        """Return what the algorithm makes of its critics' outputs, from its present settings.
+        """Return how the algorithm uses its critics' outputs, by its present settings.
 
-        None stands for an algorithm whose updates the engine does not know.
+        None if the engine does not support the algorithm's updates.
         """
         return None
 
@@ -432,7 +432,7 @@ class EngineFlow(OffPolicyAlgorithm):
 
 
 def warn_of_stock_loop(reason: str) -> None:
-    """Say that the engine does not support something."""
+    """Warn that the engine does not support a part of the model."""
     warnings.warn(
         f"training runs the stock loop, which is slower: the engine does not support {reason}",
         UserWarning,

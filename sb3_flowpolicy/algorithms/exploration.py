@@ -46,8 +46,8 @@ class NoiseProcess:
             frequencies from 1/horizon to 1/2 and is flat below.
 
     References:
-        Pink Noise Is All You Need (Eberhard et al., 2023); thesis chapter 4 on Brownian motion as
-        what independent steps amount to.
+        Pink Noise Is All You Need (Eberhard et al., 2023); thesis chapter 4, on the Brownian motion
+        that independent steps add up to.
 
     Example:
         >>> process = NoiseProcess(noise_dim=2, n_envs=3, color=1.0, horizon=40)
@@ -64,7 +64,7 @@ class NoiseProcess:
         horizon: int | None = None,
     ) -> None:
         horizon = DEFAULT_HORIZON if horizon is None else horizon
-        #: What it was made of: two processes with the same settings have the same distribution.
+        #: Arguments of the constructor: processes with the same ones have the same distribution.
         self.settings = (noise_dim, n_envs, color, correlation_time, horizon)
         if correlation_time is not None:
             decays, shares = np.array([math.exp(-1 / correlation_time)]), np.ones(1)
@@ -111,7 +111,7 @@ def _fit(color: float, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     decays = np.concatenate([[0.0], np.exp(-1 / times)])
     turns = np.cos(2 * np.pi * frequencies)[:, None]
     spectra = (1 - decays**2) / (1 - 2 * decays * turns + decays**2)
-    # Errors count relative to the power law, so each row asks for one.
+    # Errors count relative to the power law, so the target of each row is one.
     relative = spectra * frequencies[:, None] ** color
     relative /= relative.mean()
     # Least squares under non-negativity, by the multiplicative updates of Lee and Seung (2001).
@@ -142,7 +142,7 @@ class ColoredExploration:
     def fit(self, agent: OffPolicyAlgorithm, n_envs: int, env: Any) -> None:
         """Adopt the agent's present settings; a process that already has them continues.
 
-        The environment, if it is known, tells how long episodes are.
+        The time limit of the environment, if there is one, sets the horizon.
         """
         color, correlation_time = (
             check(name, getattr(agent, name)) for name, check in SETTINGS.items()

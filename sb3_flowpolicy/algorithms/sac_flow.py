@@ -55,8 +55,7 @@ class SACFlow(EngineFlow, SAC):
             weight decay, which weighs half as much at 1.0.
         compile: Whether to compile the update: several times faster after 5 to 30 seconds of
             warm-up. ``"auto"`` compiles once calls of :meth:`learn` have planned enough updates to
-            repay it. Compiled or not, the numbers are
-            the same up to rounding.
+            repay it. Compiled or not, the numbers are the same up to rounding.
         autocast: Whether matrix products run in bfloat16 (``torch.autocast``). On processors that
             support it, networks of 128 units or more train 1.2 to 1.6 times as fast, small ones
             slower. Parameters, optimizer states and replay stay float32; products keep 8 bits.

@@ -15,7 +15,7 @@ from sb3_flowpolicy.common.validation import integer
 
 
 class RunCheckpointCallback(BaseCallback):
-    """What ``SACFlow.learn(checkpoint_every=..., checkpoint_path=...)`` does, as a callback.
+    """Write checkpoints as ``SACFlow.learn(checkpoint_every=..., checkpoint_path=...)`` does.
 
     SB3's ``CheckpointCallback`` saves models to act with; this one saves runs to resume.
 

@@ -73,7 +73,7 @@ def set_log_state(logger: Logger, state: Mapping[str, Any], num_timesteps: int) 
             header = state["texts"]["CSVOutputFormat"].partition("\n")[0]
             one.keys = header.split(one.separator) if header else []
         elif isinstance(one, TensorBoardOutputFormat):
-            # The writer begins a new file with its next event, which says where the run continues.
+            # The writer begins a new file with its next event, which marks where the run continues.
             one.writer.close()
             one.writer.purge_step = num_timesteps + 1
 

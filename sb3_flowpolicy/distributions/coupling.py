@@ -198,7 +198,7 @@ class CouplingFlow(ActionDistribution):
                 nn.init.zeros_(coupling.last.bias)
 
     def shrink_heads(self) -> None:
-        """Do nothing: ``init`` says how the flow starts, by default as the identity."""
+        """Do nothing: ``init`` sets how the flow starts, by default as the identity."""
 
     def _through(
         self, context: th.Tensor, value: th.Tensor, log_prob: th.Tensor, inverse: bool

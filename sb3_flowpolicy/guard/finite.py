@@ -1,4 +1,4 @@
-"""Reject NaN and infinity in what environments return and policies are shown."""
+"""Reject NaN and infinity in observations, rewards and actions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-# Squares of numbers that float32 holds stay below; NaN compares false, so does infinity.
+# If the squares of numbers add up to less, all of them fit float32. A sum with NaN or infinity is
+# not less.
 _SURELY_FINITE = 1e76
 
 

@@ -38,7 +38,7 @@ class FlowActor(Actor):
         distribution_kwargs: Arguments of its constructor.
 
     Raises:
-        ValueError: If the density is unknown or must not be built with these arguments.
+        ValueError: If the density is unknown or an argument is out of range.
     """
 
     density: TanhSquashed

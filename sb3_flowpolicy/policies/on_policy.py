@@ -32,7 +32,7 @@ from sb3_flowpolicy.policies.sb3_distribution import (
 from sb3_flowpolicy.policies.traced import TracedCalls
 
 # Bound on the gradient of the loss with respect to a log-probability, which in PPO is advantage
-# times ratio. A larger gradient only says that the policy has left the actions it is judged by.
+# times ratio. A gradient exceeds it only where the policy has moved far from the stored actions.
 _LARGEST_GRADIENT = 1e6
 
 
