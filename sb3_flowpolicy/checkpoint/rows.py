@@ -101,4 +101,5 @@ def fill(
     for one in files:
         with np.load(folder / one["file"], allow_pickle=False) as rows:
             for name, column in columns.items():
+                # Earlier versions counted rows on around the ring.
                 column[np.arange(one["first"], one["end"]) % len(column)] = rows[name]
