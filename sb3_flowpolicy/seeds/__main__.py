@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import flowpolicy_envs  # noqa: F401, registers the environments
+from sb3_flowpolicy.checkpoint import has_checkpoint
 from sb3_flowpolicy.common.command_line import HelpFormatter, assignment, at_least, run
 from sb3_flowpolicy.common.files import write_text
 from sb3_flowpolicy.common.hyperparameters import load_hyperparameters
@@ -40,7 +41,7 @@ def main(arguments: list[str] | None = None) -> None:
     checkpoints = folder / "checkpoints"
     if args.resume:
         batch = SeedBatch.resume(checkpoints, args.env, monitor_dir=folder)
-    elif checkpoints.exists():
+    elif has_checkpoint(checkpoints):
         raise ValueError(f"{folder} must be new, or --resume given to continue the run in it")
     else:
         batch = _new_batch(args, folder)
@@ -148,7 +149,9 @@ def _parser() -> argparse.ArgumentParser:
     add("-tb", "--tensorboard-log", help="TensorBoard folder, one run per seed")
     add("--eval-episodes", type=at_least(1), default=20, help="test episodes per seed at the end")
     add("--eval-freq", type=int, help="steps between tests, written to evaluations.csv")
-    add("--num-threads", type=int, default=1, help="torch threads; one suits small networks")
+    add(
+        "--num-threads", type=at_least(1), default=1, help="torch threads; one suits small networks"
+    )
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--resume", action="store_true", help=_RESUME_HELP)
     return parser

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 
-from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
+from sb3_flowpolicy.algorithms.engine_flow import MOST_DRAWN_AT_ONCE, EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.rows import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
@@ -57,7 +57,7 @@ class SeedBatch:
         monitor_dir: Folder for one ``monitor.csv`` per seed, as SB3's ``Monitor`` writes them.
         info_keywords: Numbers to record for each episode, besides return and length, from the info
             of its last step, as in SB3's ``Monitor``.
-        **kwargs: Arguments of the agents, the same for all.
+        **kwargs: Arguments of the agents, the same for all; ``device`` is ``"cpu"``.
 
     Raises:
         ValueError: If there are no seeds, or the agents' settings cannot be stacked: training
@@ -79,6 +79,7 @@ class SeedBatch:
         info_keywords: Sequence[str] = (),
         **kwargs: Any,
     ) -> None:
+        kwargs.setdefault("device", "cpu")
         agents = {
             f"seed_{seed}": algorithm(policy, make_env(env), seed=seed, **kwargs)
             for seed in check_seeds(seeds)
@@ -204,7 +205,7 @@ class SeedBatch:
         for seed, (name, model) in zip(self.seeds, self._agents.items(), strict=True):
             own = callback(seed) if callable(callback) else copy.deepcopy(callback)
             total, reset = self._checkpoints.remaining(total_timesteps, reset_num_timesteps)
-            run = tb_log_name or type(model).__name__
+            run = tb_log_name or model.stock.__name__
             bar = progress_bar and seed == self.seeds[0]
             end, ready = model._setup_learn(total, own, reset, f"{run}_seed{seed}", bar)
             if model._checkpoints.active:
@@ -248,16 +249,19 @@ class SeedBatch:
 
     def _step(self, callbacks: dict[str, BaseCallback], log_interval: int | None) -> bool:
         """Step all environments once; return whether to continue."""
-        rewards, dones, infos = self._experience.step(self._runtime)
+        rewards, dones, infos, ended = self._experience.step(self._runtime)
         for model in self.models:
             model.num_timesteps += 1
             model._current_progress_remaining = 1 - model.num_timesteps / model._total_timesteps
         going = True
-        for k, one in enumerate(callbacks.values()):
-            info = info_of(infos.get("final_info", {}) if dones[k] else infos, k)
-            one.update_locals({"rewards": rewards[[k]], "dones": dones[[k]], "infos": [info]})
-            going = one.on_step() and going
-        for k in self._experience.record(rewards, dones, infos):
+        for k, name in enumerate(self._agents):
+            if name in callbacks:
+                info = ended.get(k) or info_of(infos, k)
+                one = callbacks[name]
+                one.update_locals({"rewards": rewards[[k]], "dones": dones[[k]], "infos": [info]})
+                going = one.on_step() and going
+        self._experience.record(ended)
+        for k in ended:
             if log_interval is not None and self.models[k]._episode_num % log_interval == 0:
                 self._dump_log(k)
         return going
@@ -272,12 +276,14 @@ class SeedBatch:
             for model in self.models:
                 for optimizer in model.optimizers().values():
                     update_learning_rate(optimizer, rate)
-        self._guard.before_updates()
-        batches = self._experience.minibatches(first.gradient_steps)
-        self._losses = engine.train(batches).tolist()
-        for model in self.models:
-            model._n_updates += first.gradient_steps
-        self._guard.after_updates(LOSSES, self._losses, engine.history, batches)
+        for start in range(0, first.gradient_steps, MOST_DRAWN_AT_ONCE):
+            n_updates = min(MOST_DRAWN_AT_ONCE, first.gradient_steps - start)
+            self._guard.before_updates()
+            batches = self._experience.minibatches(n_updates)
+            self._losses = engine.train(batches, start).tolist()
+            for model in self.models:
+                model._n_updates += n_updates
+            self._guard.after_updates(LOSSES, self._losses, engine.history, batches)
 
     def _dump_log(self, index: int) -> None:
         """Write an agent's log, after recording what SB3 records at each update."""

@@ -112,11 +112,14 @@ class SeedExperience:
         """Forget the running episodes: their environments were reset."""
         self.returns[:], self.lengths[:] = 0, 0
 
-    def step(self, runtime: EngineRuntime) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, runtime: EngineRuntime
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, Any], dict[int, dict[str, Any]]]:
         """Step all environments once and store the transitions.
 
         Returns:
-            Rewards (S,), which episodes ended (S,), and the infos of the vectorized environment.
+            Rewards (S,), which episodes ended (S,), the infos of the vectorized environment, and
+            for each agent whose episode ended its last info as SB3's ``VecEnv`` returns it.
         """
         assert self.obs is not None
         first = self.models[0]
@@ -142,7 +145,18 @@ class SeedExperience:
         )
         self.obs = obs
         self._exploration.restart(dones)
-        return rewards, dones, infos
+        self.returns += rewards
+        self.lengths += 1
+        ended = {
+            index: {
+                **self._end_of_episode(index, infos),
+                "terminal_observation": next_obs[index],
+                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
+            }
+            for index in np.flatnonzero(dones).tolist()
+        }
+        self.returns[dones], self.lengths[dones] = 0, 0
+        return rewards, dones, infos, ended
 
     def _act(self, runtime: EngineRuntime, obs: np.ndarray) -> np.ndarray:
         """Return scaled actions, (S, *shape)."""
@@ -168,29 +182,25 @@ class SeedExperience:
             buffer.pos = (row + 1) % buffer.buffer_size
             buffer.full = buffer.full or buffer.pos == 0
 
-    def record(self, rewards: np.ndarray, dones: np.ndarray, infos: dict[str, Any]) -> list[int]:
-        """Record what :meth:`step` returned as SB3's ``Monitor`` and algorithms do.
+    def _end_of_episode(self, index: int, infos: dict[str, Any]) -> dict[str, Any]:
+        """Return an agent's last info of an episode, with SB3's ``Monitor``'s entry."""
+        info = info_of(infos.get("final_info", {}), index)
+        info["episode"] = {
+            "r": round(float(self.returns[index]), 6),
+            "l": int(self.lengths[index]),
+            "t": round(time.time() - self._start, 6),
+            **{name: info[name] for name in self.info_keywords},
+        }
+        return info
 
-        Returns:
-            The agents whose episodes ended.
-        """
-        self.returns += rewards
-        self.lengths += 1
-        ended = np.flatnonzero(dones).tolist()
-        for index in ended:
-            model, info = self.models[index], info_of(infos.get("final_info", {}), index)
-            episode = {
-                "r": round(float(self.returns[index]), 6),
-                "l": int(self.lengths[index]),
-                "t": round(time.time() - self._start, 6),
-                **{name: info[name] for name in self.info_keywords},
-            }
-            model._update_info_buffer([{**info, "episode": episode}], dones[[index]])
+    def record(self, ended: dict[int, dict[str, Any]]) -> None:
+        """Record the episodes that :meth:`step` returned, as SB3's algorithms do."""
+        for index, info in ended.items():
+            model = self.models[index]
+            model._update_info_buffer([info], np.array([True]))
             if self._writers:
-                self._writers[index].write_row(episode)
+                self._writers[index].write_row(info["episode"])
             model._episode_num += 1
-        self.returns[ended], self.lengths[ended] = 0, 0
-        return ended
 
     def minibatches(self, count: int) -> list[Batch]:
         """Draw minibatches of all agents for as many updates."""
@@ -252,14 +262,19 @@ class SeedNoise:
 
     def draw(self, count: int = 1) -> th.Tensor:
         """Return the next ``count`` numbers of every seed, (count, S, *shape)."""
-        if not len(self._pool):
-            # Uniform numbers become indices; float32 cannot represent all of a million rows.
-            draw, dtype = (th.rand, th.float64) if self.uniform else (th.randn, th.float32)
-            self._pool = th.stack(
-                [draw(AHEAD, *self.shape, generator=own, dtype=dtype) for own in self.generators], 1
-            )
-        found, self._pool = self._pool[:count], self._pool[count:]
-        return found if len(found) == count else th.cat([found, self.draw(count - len(found))])
+        # Uniform numbers become indices; float32 cannot represent all of a million rows.
+        draw, dtype = (th.rand, th.float64) if self.uniform else (th.randn, th.float32)
+        parts = []
+        while count:
+            if not len(self._pool):
+                numbers = [
+                    draw(AHEAD, *self.shape, generator=own, dtype=dtype) for own in self.generators
+                ]
+                self._pool = th.stack(numbers, 1)
+            part, self._pool = self._pool[:count], self._pool[count:]
+            parts.append(part)
+            count -= len(part)
+        return parts[0] if len(parts) == 1 else th.cat(parts)
 
     def state(self) -> dict[str, Any]:
         """Return everything needed to continue with the same numbers."""

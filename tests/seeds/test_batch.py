@@ -17,6 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
+from sb3_flowpolicy.seeds.experience import SeedNoise
 from tests.reach import make_reach
 
 FAST: dict[str, Any] = {
@@ -247,6 +248,55 @@ def test_callbacks_see_every_step_of_their_own_agent() -> None:
         for info, done, reward in zip(infos, buffer.dones, buffer.rewards, strict=False):
             assert isinstance(info["is_success"], bool)
             assert info["is_success"] == bool(done[0] and reward[0] > 0)
+
+
+def test_last_infos_are_those_of_sb3s_environments() -> None:
+    batch = SeedBatch("FlowPolicy", ENV, 2, **FAST).learn(60, callback=StopAt(60))
+    for model in batch.models:
+        infos, buffer = model.told, model.replay_buffer  # type: ignore[attr-defined]
+        assert buffer is not None
+        ended = np.flatnonzero(buffer.dones[:60, 0])
+        assert len(ended) > 10
+        assert [k for k, info in enumerate(infos) if "episode" in info] == ended.tolist()
+        starts = [0, *(ended[:-1] + 1)]
+        for start, end in zip(starts, ended, strict=True):
+            info, rewards = infos[end], buffer.rewards[start : end + 1, 0]
+            assert info["episode"]["l"] == len(rewards)
+            assert info["episode"]["r"] == pytest.approx(rewards.sum(), abs=1e-5)
+            assert np.array_equal(info["terminal_observation"], buffer.next_observations[end, 0])
+            assert info["TimeLimit.truncated"] == bool(buffer.timeouts[end, 0])
+
+
+def test_a_callback_for_some_seeds_sees_these() -> None:
+    batch = SeedBatch("FlowPolicy", ENV, 3, **FAST)
+    batch.learn(50, callback=lambda seed: StopAt(50) if seed == 2 else None)
+    first, _, last = batch.models
+    assert "told" not in first.__dict__
+    assert last.replay_buffer is not None
+    seen = [info["episode"]["l"] for info in last.told if "episode" in info]  # type: ignore[attr-defined]
+    ended = np.flatnonzero(last.replay_buffer.dones[:50, 0])
+    assert seen == np.diff([-1, *ended]).tolist()
+
+
+def test_noise_is_drawn_in_any_number() -> None:
+    def noise() -> SeedNoise:
+        return SeedNoise([3, 4], (2,), 0, uniform=False)
+
+    many = noise().draw(70_000)
+    one_by_one = noise()
+    assert many.shape == (70_000, 2, 2)
+    assert th.equal(many[:130], th.cat([one_by_one.draw(count) for count in (1, 64, 65)]))
+
+
+def test_updates_are_drawn_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def trained(most: int) -> np.ndarray:
+        monkeypatch.setattr("sb3_flowpolicy.seeds.batch.MOST_DRAWN_AT_ONCE", most)
+        settings = {**FAST, "train_freq": 10, "gradient_steps": 10}
+        batch = SeedBatch("FlowPolicy", ENV, 2, **settings).learn(60)
+        assert batch.models[0]._n_updates == 30
+        return vector(batch.models[1])
+
+    np.testing.assert_allclose(trained(4), trained(1000), rtol=1e-5, atol=1e-6)
 
 
 def test_learns_what_a_single_agent_learns() -> None:
