@@ -18,6 +18,9 @@ from sb3_flowpolicy.guard.finite import all_finite
 
 KEYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
 
+# What gym.make_vec adds to the arguments of the environment in its spec.
+_OF_MAKE_VEC = {"num_envs", "vectorization_mode", "autoreset_mode", "max_episode_steps"}
+
 
 def record_demonstrations(
     env: gym.Env, controller: Callable[[Any], np.ndarray], n_steps: int, seed: int | None = None
@@ -41,7 +44,8 @@ def record_demonstrations(
     for _ in range(n_steps):
         action = np.asarray(controller(obs))
         next_obs, reward, terminated, truncated, _ = env.step(action)
-        row = (obs, action, reward, next_obs, terminated, truncated)
+        # Copies, as an environment may return the same array at every step.
+        row = (np.array(obs), action, reward, np.array(next_obs), terminated, truncated)
         for column, value in zip(columns.values(), row, strict=True):
             column.append(value)
         obs = env.reset()[0] if terminated or truncated else next_obs
@@ -89,8 +93,9 @@ def follow_recipe(
     if spec is None:
         raise ValueError("demonstrations can be recorded only in environments made from an id")
     # Without wrappers such as SB3's Monitor, which would count these episodes.
-    kwargs = {**spec.kwargs, "render_mode": None}
-    fresh = gym.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
+    kwargs = {name: value for name, value in spec.kwargs.items() if name not in _OF_MAKE_VEC}
+    kwargs |= {"render_mode": None, "max_episode_steps": spec.max_episode_steps}
+    fresh = gym.make(spec.id, **kwargs)
     with closing(fresh):
         return record_demonstrations(fresh, act, n_steps, seed)
 

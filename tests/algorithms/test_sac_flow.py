@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import configure
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import SACFlow
 from sb3_flowpolicy.algorithms.demonstrations import load_demonstrations, record_demonstrations
+from sb3_flowpolicy.common.vec_env import make_batched_env
 from sb3_flowpolicy.engine import Engine, runtime
 
 FAST: dict[str, Any] = {
@@ -193,9 +194,11 @@ def test_flags_of_any_type_mean_the_same(dtype: type) -> None:
     assert (buffer.dones[39, 0], buffer.timeouts[39, 0]) == (1.0, 0.0)
 
 
-def test_demonstrations_may_be_a_recipe() -> None:
+@pytest.mark.parametrize("batched", [False, True])
+def test_demonstrations_may_be_a_recipe(batched: bool) -> None:
     recipe = {"controller": "flowpolicy_envs.Holder", "n_steps": 90}
-    model = SACFlow("FlowPolicy", "SquareMove-v0", demonstrations=recipe, **FAST)
+    env = make_batched_env("SquareMove-v0") if batched else "SquareMove-v0"
+    model = SACFlow("FlowPolicy", env, demonstrations=recipe, **FAST)
     model.learn(5)
     buffer = model.replay_buffer
     assert buffer is not None
