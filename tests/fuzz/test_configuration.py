@@ -57,6 +57,7 @@ SQUARE = [
     *("weight", "kp", "kd", "finger_damping", "max_force", "max_speed", "reach"),
     *("finger_distance", "finger_noise", "start_x", "start_y", "start_angle", "warm_up"),
     *("observe", "observation_noise", "stack", "dt", "substeps", "render_mode", "render_size"),
+    *("slew", "friction_cone"),
 ]
 
 

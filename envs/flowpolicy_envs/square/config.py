@@ -115,8 +115,10 @@ class SquareConfig:
                 f"finger_distance must be at least half the size, {ranges['size'][1] / 2:g}, "
                 f"got {self.finger_distance}: fingers start outside the square"
             )
-        if not is_number(self.dt) or not 0.0 < self.dt < math.inf:
-            raise ValueError(f"dt must be positive, got {self.dt!r}")
+        if not is_number(self.dt) or not 1e-6 <= self.dt < math.inf:
+            raise ValueError(f"dt must be at least 1e-6 s, got {self.dt!r}")
+        if not isinstance(self.friction_cone, bool):
+            raise ValueError(f"friction_cone must be True or False, got {self.friction_cone!r}")
         for name in ("stack", "substeps"):
             value = getattr(self, name)
             if not is_whole(value) or value < 1:
