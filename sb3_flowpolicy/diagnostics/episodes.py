@@ -77,8 +77,14 @@ def rollout_figure(
 
 
 def sequence_figure(frames: Sequence[np.ndarray], first: int, n_steps: int) -> Figure:
-    """Draw ``n_steps`` steps of an episode side by side, from step ``first``, counted from 0."""
-    return _panels(frames, range(first, first + n_steps), 2.4, 2.6)
+    """Draw up to ``n_steps`` steps of an episode side by side, from step ``first``, counted from 0.
+
+    Raises:
+        ValueError: If the episode has no such step.
+    """
+    if first >= len(frames):
+        raise ValueError(f"first step must be below {len(frames)}, the frames, got {first}")
+    return _panels(frames, range(len(frames))[first : first + n_steps], 2.4, 2.6)
 
 
 def _panels(

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sb3_flowpolicy.common.command_line import run
+from sb3_flowpolicy.common.command_line import at_least, run
 from sb3_flowpolicy.diagnostics import evaluate_success, rollout_figure
 from sb3_flowpolicy.zoo.saved_run import load_run, run_parser
 
@@ -12,7 +12,7 @@ def main(arguments: list[str] | None = None) -> None:
     description = "Print the success rate of a trained model and draw its policy."
     parser = run_parser("evaluate", description)
     add = parser.add_argument
-    add("-n", "--n-episodes", type=int, default=100, help="episodes per success rate")
+    add("-n", "--n-episodes", type=at_least(1), default=100, help="episodes per success rate")
     add("-o", "--output", type=Path, help="picture (default: policy.png next to the model)")
     args = parser.parse_args(arguments)
 

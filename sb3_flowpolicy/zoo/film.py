@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sb3_flowpolicy.common.command_line import run
+from sb3_flowpolicy.common.command_line import at_least, run
 from sb3_flowpolicy.diagnostics.episodes import episode_frames, sequence_figure, write_video
 from sb3_flowpolicy.zoo.saved_run import load_run, run_parser
 
@@ -15,14 +15,14 @@ def main(arguments: list[str] | None = None) -> None:
         "picture of consecutive steps. Works for all environments of this package.",
     )
     add = parser.add_argument
-    add("-n", "--n-episodes", type=int, default=1, help="episodes in the video")
-    add("--n-samples", type=int, default=300, help="action samples drawn at each step")
+    add("-n", "--n-episodes", type=at_least(1), default=1, help="episodes in the video")
+    add("--n-samples", type=at_least(1), default=300, help="action samples drawn at each step")
     add("--deterministic", action="store_true", help="act without exploration")
     add("--slow-down", type=float, default=1.0, help="times slower than real time")
     add("-o", "--output", type=Path, help="video (default: film.mp4 next to the model)")
     add("--sequence", type=Path, help="picture of consecutive steps of the first episode")
-    add("--first-step", type=int, default=17, help="first step of the sequence")
-    add("--steps", type=int, default=7, help="number of steps of the sequence")
+    add("--first-step", type=at_least(0), default=0, help="first step of the sequence")
+    add("--steps", type=at_least(1), default=7, help="number of steps of the sequence, at most")
     args = parser.parse_args(arguments)
 
     model, env, path = load_run(args)

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -48,13 +49,18 @@ def load_run(args: argparse.Namespace) -> tuple[BaseAlgorithm, VecEnv, Path]:
     _, model_path, log_path = get_model_path(
         args.exp_id, args.folder, args.algo, env_name, args.load_best
     )
-    hyperparams, stats_path = get_saved_hyperparams(str(Path(log_path, env_name)), test_mode=True)
+    settings = Path(log_path, env_name)
+    hyperparams, stats_path = get_saved_hyperparams(str(settings), test_mode=True)
+    env_kwargs = hyperparams.pop("env_kwargs", {})
+    # Arguments of the command line, which rl_zoo3 stores elsewhere.
+    if (settings / "args.yml").is_file():
+        env_kwargs |= yaml.unsafe_load((settings / "args.yml").read_text())["env_kwargs"] or {}
     env = create_test_env(
         env_name.gym_id,
         stats_path=stats_path,
         seed=args.seed,
         should_render=False,
         hyperparams=hyperparams,
-        env_kwargs={**hyperparams.pop("env_kwargs", {}), "render_mode": "rgb_array"},
+        env_kwargs={**env_kwargs, "render_mode": "rgb_array"},
     )
     return ALGOS[args.algo].load(model_path, device="cpu"), env, Path(model_path)

@@ -41,8 +41,10 @@ def test_sequences_show_consecutive_steps(frames: list[np.ndarray]) -> None:
     assert [axes.get_title() for axes in figure.axes] == ["step 1", "step 2", "step 3"]
     for k, axes in enumerate(figure.axes):
         assert np.array_equal(axes.images[0].get_array(), frames[1 + k])  # type: ignore[arg-type]
-    with pytest.raises(IndexError):
-        sequence_figure(frames, first=4, n_steps=2)
+    figure = sequence_figure(frames, first=3, n_steps=7)
+    assert [axes.get_title() for axes in figure.axes] == ["step 3", "step 4"]
+    with pytest.raises(ValueError, match="first step must be below 5, the frames, got 5"):
+        sequence_figure(frames, first=5, n_steps=2)
 
 
 def test_videos_hold_all_frames(frames: list[np.ndarray], tmp_path: Path) -> None:
