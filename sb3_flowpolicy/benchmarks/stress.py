@@ -21,6 +21,7 @@ from stable_baselines3.common.logger import configure
 
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.benchmarks.updates import Unmoved
+from sb3_flowpolicy.common.command_line import check_folder_of
 from sb3_flowpolicy.common.files import replacing
 from sb3_flowpolicy.distributions import registered_distributions
 from sb3_flowpolicy.guard.finite import NonFiniteError
@@ -157,6 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--csv", type=Path, help="also write the table to this file")
     args = parser.parse_args(arguments)
+    check_folder_of(parser, "--csv", args.csv)
     th.set_num_threads(1)
     outcomes = []
     for distribution, name in product(registered_distributions(), CASES):

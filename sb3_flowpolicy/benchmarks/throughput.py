@@ -11,7 +11,7 @@ from pathlib import Path
 import torch as th
 
 from sb3_flowpolicy.benchmarks.timing import Row, measure, table
-from sb3_flowpolicy.common.command_line import check_folder_of
+from sb3_flowpolicy.common.command_line import at_least, check_folder_of
 from sb3_flowpolicy.common.files import write_json
 from sb3_flowpolicy.common.machine import machine
 
@@ -69,7 +69,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--json", type=Path, metavar="FILE", help="also write all results to this file")
     only = f"measure one group: {', '.join(GROUPS)}; may be repeated (default: all)"
     add("--only", action="append", choices=list(GROUPS), metavar="GROUP", help=only)
-    add("--threads", type=int, help=f"threads of torch (default here: {th.get_num_threads()})")
+    add(
+        "--threads",
+        type=at_least(1),
+        help=f"threads of torch (default here: {th.get_num_threads()})",
+    )
     quick = "a trial of less than a minute, with few rows and short turns: do not quote its rates"
     add("--quick", action="store_true", help=quick)
     args = parser.parse_args(arguments)

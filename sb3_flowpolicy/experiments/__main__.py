@@ -65,9 +65,9 @@ def _run(args: argparse.Namespace) -> None:
         finished = {item.key for item in plan.items} - {item.key for item in items}
         print(
             f"{experiment.name} ({experiment.claim}): {len(plan.items)} items of {plan.steps:,} "
-            f"steps x {len(plan.items[0].seeds)} seeds, {len(finished)} finished before, "
-            f"{args.workers} at a time\n"
-            f"Results: {folder}"
+            f"steps x {len(plan.items[0].seeds)} seeds, {len(finished)} finished before"
+            + (f", {args.workers} at a time" if args.backend == "local" else "")
+            + f"\nResults: {folder}"
         )
         if items:
             with Progress(plan.items, finished, shown=not args.no_progress) as progress:

@@ -63,6 +63,7 @@ def run_on_ray(
             for reference in done:
                 item = waiting.pop(reference)
                 for name, data in ray.get(reference).items():
+                    (folder / name).parent.mkdir(exist_ok=True)
                     with replacing(folder / name) as draft:
                         draft.write_bytes(data)
                 progress.note(item.key, item.steps)
@@ -90,5 +91,9 @@ def _run_remotely(item: WorkItem, reports: Any) -> dict[str, bytes]:
         files = ItemFiles(Path(name), item.key)
         run_item(item, files.folder, lambda key, steps: reports.put((key, steps)))
         # The file that declares the item finished comes last.
-        paths = (files.table, files.details, files.done)
-        return {path.name: path.read_bytes() for path in paths if path.exists()}
+        paths = (files.table, files.details, files.agent, files.done)
+        return {
+            str(path.relative_to(files.folder)): path.read_bytes()
+            for path in paths
+            if path.exists()
+        }

@@ -106,7 +106,10 @@ def vary(
     for setting in experiment.settings if env_kwargs else ():
         register_env(setting.env_id)
         try:
-            gym.make(setting.env_id, **{**setting.env_kwargs, **env_kwargs}).close()
+            # By a spec, as gym.make takes some arguments for itself.
+            base = gym.spec(setting.env_id)
+            kwargs = {**base.kwargs, **setting.env_kwargs, **env_kwargs}
+            gym.make(replace(base, kwargs=kwargs)).close()
         except TypeError as error:
             raise ValueError(f"--set must name arguments of {setting.env_id}: {error}") from None
     known = {agent.name: agent for agent in experiment.agents}

@@ -77,6 +77,7 @@ def test_tuning_changes_the_environment_and_leaves_agents_out(
     ("arguments", "message"),
     [
         (["tiny", "--set", "dens_reward=1"], "--set must name arguments of"),
+        (["tiny", "--set", "max_episode_steps=9"], "--set must name arguments of"),
         (["tiny", "--agents", "flow", "lr"], "agents of tiny must be among ['gauss', 'flow'], got"),
         (["tiny", "--address", "auto"], "--address needs --backend ray, got 'local'"),
     ],

@@ -37,6 +37,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error("--results needs --figure")
     for name in ("json", "figure"):
         check_folder_of(parser, f"--{name}", getattr(args, name))
+    evidence = None
+    if args.figure is not None:
+        # Slow imports that the table does not need.
+        from sb3_flowpolicy.experiments.dimensions import figures
+
+        try:
+            evidence = None if args.results is None else figures.read_results(args.results)
+        except ValueError as error:
+            parser.error(f"--results: {error}")
     rows = [
         {
             "dims": dims,
@@ -60,17 +69,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.json is not None:
         write_json(args.json, {"survival": args.survival, "rows": rows})
     if args.figure is not None:
-        # Slow imports that the table does not need.
-        from sb3_flowpolicy.experiments.dimensions.figures import prediction_figure, results_figure
-
-        try:
-            figure = (
-                prediction_figure(table, args.survival)
-                if args.results is None
-                else results_figure(table, args.results)
-            )
-        except ValueError as error:
-            parser.error(f"--results: {error}")
+        figure = (
+            figures.prediction_figure(table, args.survival)
+            if evidence is None
+            else figures.results_figure(table, evidence)
+        )
         figure.savefig(args.figure, dpi=110)
 
 

@@ -52,18 +52,21 @@ def prediction_figure(table: pd.DataFrame, survival: float) -> Figure:
     return figure
 
 
-def results_figure(table: pd.DataFrame, results: Path) -> Figure:
-    """Draw how many seeds solve the task, and after how many steps, by number of dimensions.
-
-    Broken lines are the predicted numbers of seeds that find the goal by noise alone.
-
-    Raises:
-        ValueError: If the folder has no results of the experiment.
-    """
+def read_results(results: Path) -> Evidence:
+    """Read the experiment's results; raise ``ValueError`` if the folder has none."""
     experiment = EXPERIMENTS["diagonal-widened"]
     evidence = Evidence(experiment, results / experiment.name)
     if not evidence.measured:
         raise ValueError(f"no results of {experiment.name} in {results}")
+    return evidence
+
+
+def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
+    """Draw how many seeds solve the task, and after how many steps, by number of dimensions.
+
+    Broken lines are the predicted numbers of seeds that find the goal by noise alone.
+    """
+    experiment = evidence.experiment
     figure = new_figure(9.0, 4.2)
     left, right = figure.subplots(1, 2)
     for place, agent in enumerate(experiment.agents):

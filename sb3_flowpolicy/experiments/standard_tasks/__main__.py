@@ -91,4 +91,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from sb3_flowpolicy.common.command_line import run
+
+    run(main)
