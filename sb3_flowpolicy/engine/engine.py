@@ -37,8 +37,10 @@ class Engine(BoundEngine):
         self.critic_adam = FlatAdam(
             self.networks.critic, [policy.critic.optimizer for policy in policies]
         )
-        self.acting_parts = [self.networks.actor, *self.networks.others]
-        self.parts = [*self.acting_parts, self.networks.critic, self.actor_adam, self.critic_adam]
+        networks, device = self.networks, self.networks.actor.data.device
+        self.acting_parts = networks.acting
+        self.parts = [networks.actor, networks.critic, *networks.others]
+        self.parts += [self.actor_adam, self.critic_adam]
         self.log_ent_coef: FlatParameters | None = None
         self.ent_coef_adam: FlatAdam | None = None
         if first.ent_coef_optimizer is not None:
@@ -50,7 +52,6 @@ class Engine(BoundEngine):
             self.ent_coef_adam = FlatAdam(self.log_ent_coef, optimizers)
             self.parts += [self.log_ent_coef, self.ent_coef_adam]
         self._note([place for model in self.models for place in _places(model)])
-        networks, device = self.networks, self.networks.actor.data.device
 
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
             return networks.sample(actor, obs, noise)[0]

@@ -44,6 +44,11 @@ class StackedNetworks:
         targets = [_critic_layout(policy.critic_target) for policy in policies]
         return [FlatParameters(targets, True)]
 
+    @property
+    def acting(self) -> list[FlatParameters]:
+        """What :meth:`sample` reads."""
+        return [self.actor]
+
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:

@@ -82,6 +82,11 @@ class RenormNetworks(StackedNetworks):
             _buffers(critics, counts=True, copies=True),
         ]
 
+    @property
+    def acting(self) -> list[FlatParameters]:
+        """The actor and its running statistics."""
+        return [self.actor, self.others[_ACTOR], self.others[_STEPS_OF_ACTOR]]
+
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
