@@ -12,28 +12,41 @@ from typing import Any
 import torch as th
 
 
+class Compiler:
+    """Whether, and for which device, the functions of an engine are compiled.
+
+    Args:
+        device: Device of their tensors.
+        enabled: Whether to compile. Once a function could not be compiled, none is.
+    """
+
+    def __init__(self, device: th.device, enabled: bool = True) -> None:
+        self.device = device
+        self.enabled = enabled
+
+
 class Compiled:
     """A function of tensors compiled into one graph per kind of call; its closure must not change.
 
     The first call compiles and prints a message: the SAC update takes 5 to 30 seconds, less from
     the second run on, as torch caches it on disk. If compiling fails because a C++ compiler or a
-    feature of torch is missing, the function runs eagerly from then on, with one warning.
+    feature of torch is missing, all functions of ``compiler`` run eagerly from then on, with one
+    warning.
     """
 
-    def __init__(self, function: Callable[..., Any], name: str, device: th.device) -> None:
+    def __init__(self, function: Callable[..., Any], name: str, compiler: Compiler) -> None:
         self.function = function
         self.name = name
-        self.eager = False
-        self._device = device
+        self._compiler = compiler
         self._graphs: dict[Hashable, Callable[..., Any]] = {}
 
     def __contains__(self, key: Hashable) -> bool:
-        """Whether there is a graph for such calls."""
-        return key in self._graphs
+        """Whether such calls run a graph."""
+        return self._compiler.enabled and key in self._graphs
 
     def __call__(self, key: Hashable, *arguments: Any) -> Any:
         """Call the function; ``key`` tells apart calls that need different graphs."""
-        if self.eager:
+        if not self._compiler.enabled:
             return self.function(*arguments)
         graph = self._graphs.get(key)
         return self._compile(key, *arguments) if graph is None else graph(*arguments)
@@ -46,7 +59,7 @@ class Compiled:
         function = FunctionType(code, self.function.__globals__, closure=self.function.__closure__)
         try:
             graph = th.compile(
-                function, fullgraph=True, dynamic=False, options=_options(self._device)
+                function, fullgraph=True, dynamic=False, options=_options(self._compiler.device)
             )
         except (AttributeError, RuntimeError) as error:  # this torch or Python lacks a feature
             return self._run_eagerly(error, *arguments)
@@ -62,7 +75,7 @@ class Compiled:
         return result
 
     def _run_eagerly(self, error: Exception, *arguments: Any) -> Any:
-        self.eager = True
+        self._compiler.enabled = False
         warnings.warn(
             f"{self.name} could not be compiled and runs eagerly: the same numbers, only "
             f"slower ({type(error).__name__}: {str(error).strip().splitlines()[0]})",

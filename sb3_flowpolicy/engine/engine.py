@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
-from sb3_flowpolicy.engine.compiling import Compiled
+from sb3_flowpolicy.engine.compiling import Compiled, Compiler
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.engine.replay import ReplayRows, draw_index, is_plain, sample_columns
@@ -56,10 +56,10 @@ class Engine(BoundEngine):
         def sample(actor: th.Tensor, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
             return networks.sample(actor, obs, noise)[0]
 
-        self._update = self.objective.make_update(networks, self.settings)
-        self._compiled_update = Compiled(self._update, f"the {self.objective.name} update", device)
-        self._sample = sample
-        self._compiled_sample = Compiled(sample, "the policy", device)
+        self.compiler = Compiler(device, enabled=compiled)
+        update = self.objective.make_update(networks, self.settings)
+        self._update = Compiled(update, f"the {self.objective.name} update", self.compiler)
+        self._sample = Compiled(sample, "the policy", self.compiler)
         #: Losses of each update of the last :meth:`train`, (4, S): to find out which went wrong.
         self.history: list[th.Tensor] = []
         #: Names of the losses to log of the last :meth:`train`.
@@ -110,11 +110,6 @@ class Engine(BoundEngine):
             *map(adam_settings, optimizers),  # type: ignore[arg-type]
         )
 
-    def _runs_compiled(self) -> bool:
-        """Whether to call compiled functions: not after one could not be compiled."""
-        eager = self._compiled_update.eager or self._compiled_sample.eager
-        return self.compiled and not eager
-
     @th.no_grad()
     def act(self, obs: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
         """Sample scaled actions in [-1, 1], (S, N, D), for observations (S, N, ...).
@@ -125,9 +120,7 @@ class Engine(BoundEngine):
         if noise is None:
             shape = (*obs.shape[:2], self.networks.noise_dim)
             noise = th.randn(shape, dtype=actor.dtype, device=actor.device)
-        if self._runs_compiled():
-            return self._compiled_sample((obs.shape, obs.dtype), actor, obs, noise)
-        return self._sample(actor, obs, noise)
+        return self._sample((obs.shape, obs.dtype), actor, obs, noise)
 
     def act_if_compiled(self, obs: Any, deterministic: bool) -> np.ndarray | None:
         """Act for one seed if there is a graph for so many observations, as tensors (N, ...).
@@ -136,7 +129,7 @@ class Engine(BoundEngine):
             Scaled actions, (N, D), or None.
         """
         rows = self.networks.observations.pack(obs).unsqueeze(0).contiguous()
-        if not self._runs_compiled() or (rows.shape, rows.dtype) not in self._compiled_sample:
+        if (rows.shape, rows.dtype) not in self._sample:
             return None
         noise = None
         if deterministic:  # the mode is the image of no noise
@@ -240,10 +233,8 @@ class Engine(BoundEngine):
     def _update_once(
         self, state: TrainState, batch: Batch, learning_rates: th.Tensor, flag: bool
     ) -> th.Tensor:
-        if not self._runs_compiled():
-            return self._update(state, batch, learning_rates, flag)
         key = (batch.noise.shape, batch.noise.stride(), batch.obs.stride(), flag)
-        return self._compiled_update(key, state, batch, learning_rates, flag)
+        return self._update(key, state, batch, learning_rates, flag)
 
 
 def _can_be_rows(model: Any) -> bool:

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
 from sb3_flowpolicy.engine.adam import FlatAdam, adam_settings
-from sb3_flowpolicy.engine.compiling import Compiled
+from sb3_flowpolicy.engine.compiling import Compiled, Compiler
 from sb3_flowpolicy.engine.flat import FlatParameters
 from sb3_flowpolicy.engine.ppo_update import (
     PPO_LOSSES,
@@ -42,12 +42,11 @@ class PPOEngine(BoundEngine):
         for module in policy.modules():
             places += [(module._parameters, name) for name in module._parameters]
         self._note(places)
-        device = self.flat.data.device
-        self._eager_update = make_ppo_update(policy, self.flat, self.settings)
-        self._update = Compiled(self._eager_update, "the PPO update", device)
+        self.compiler = Compiler(self.flat.data.device, enabled=compiled)
+        update = make_ppo_update(policy, self.flat, self.settings)
+        self._update = Compiled(update, "the PPO update", self.compiler)
         act = policy_function(policy, self.flat, "sample_and_score")
-        self._act = Compiled(act, "the policy", device)
-        self._update.eager = self._act.eager = not compiled
+        self._act = Compiled(act, "the policy", self.compiler)
         self._is_watched = True
 
     @staticmethod
@@ -147,5 +146,5 @@ class PPOEngine(BoundEngine):
         arguments = (self.flat.data, self.adam.moments, samples, noise, scalars)
         # The rest of a rollout that does not fill a minibatch is not worth a graph of its own.
         if size < self.model.batch_size:
-            return self._eager_update(*arguments)
+            return self._update.function(*arguments)
         return self._update(size, *arguments)

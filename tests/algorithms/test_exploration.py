@@ -96,7 +96,7 @@ def test_compiled_or_not_the_actions_are_the_same() -> None:
             if compiled:  # takes the engine's path, whose function stays eager
                 engine = model._runtime.engine()
                 assert engine is not None
-                engine.compiled = engine._compiled_sample.eager = True
+                engine.compiled = True
             th.manual_seed(5)
             found.append(act(model, 3))
     np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6)

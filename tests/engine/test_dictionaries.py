@@ -66,7 +66,7 @@ def check_equal(
         seed_everything()
         stock_loop(model)
     assert ours._runtime._engine is not None
-    assert not ours._runtime._engine._compiled_update.eager
+    assert ours._runtime._engine.compiler.enabled == compile
     assert_same(ours, stock, dtype)
 
 

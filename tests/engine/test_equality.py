@@ -142,7 +142,7 @@ def check_equal_to_sb3(
     ours.train(N_UPDATES, batch_size=BATCH_SIZE)
     assert ours._runtime._engine is not None  # neither took SB3's loop ...
     assert ours._runtime._engine.compiled == compile
-    assert not ours._runtime._engine._compiled_update.eager  # ... nor gave up compiling
+    assert ours._runtime._engine.compiler.enabled == compile  # ... nor gave up compiling
     assert_same(ours, stock, dtype)
 
 
@@ -252,7 +252,7 @@ def test_crossq_equals_sb3_contribs(
         batches = engine.draw(N_UPDATES, BATCH_SIZE)
         engine.draw = lambda *_: batches
         ours.train(N_UPDATES, BATCH_SIZE)
-        assert engine._runs_compiled() == compile
+        assert engine.compiler.enabled == compile
     crossq_loop(stock, batches)
     assert_same(ours, stock, dtype)
 
@@ -276,10 +276,10 @@ def check_stacked(
     rate = th.full((3,), 3e-4, dtype=th.float64)
     np.random.seed(1)  # noqa: NPY002
     for step, batch in enumerate(stacked.draw(N_UPDATES, BATCH_SIZE)):
-        losses = stacked._update(stacked.state(), batch, rate, step % 2 == 0)
+        losses = stacked._update.function(stacked.state(), batch, rate, step % 2 == 0)
         for seed, single in enumerate(singles):
             own = batch.of(slice(seed, seed + 1))
-            expected = single._update(single.state(), own, rate, step % 2 == 0)
+            expected = single._update.function(single.state(), own, rate, step % 2 == 0)
             th.testing.assert_close(losses[:, [seed]], expected, rtol=1e-4, atol=1e-5)
     for got, single in zip(stacked.models, singles, strict=True):
         assert_close(everything(got), everything(single.models[0]), dtype)
@@ -305,7 +305,7 @@ def test_updating_seeds_in_groups_changes_nothing(
         losses = [engine.train(engine.draw(5, BATCH_SIZE)) for _ in range(2)]
         sizes = [len(part.actor) for _, part in engine._groups(BATCH_SIZE)]
         assert sizes == ([2, 2] if in_groups else [n_seeds])
-        assert engine._runs_compiled() == (compiled and in_groups)
+        assert engine.compiler.enabled == (compiled and in_groups)
         engines.append((engine, th.stack(losses)))
     (whole, expected), (grouped, losses_in_groups) = engines
     assert expected.shape == (2, 4, n_seeds)

@@ -13,7 +13,7 @@ import pytest
 import torch as th
 
 from sb3_flowpolicy import SACFlow
-from sb3_flowpolicy.engine.compiling import Compiled
+from sb3_flowpolicy.engine.compiling import Compiled, Compiler
 
 SMALL: dict[str, Any] = {
     "learning_starts": 20,
@@ -68,9 +68,12 @@ def test_torch_lacks_a_feature(missing: str, monkeypatch: pytest.MonkeyPatch) ->
     else:
         monkeypatch.delattr(f"torch.{missing}")
     x = th.linspace(-1, 1, 5)
-    compiled = Compiled(lambda x: (x.exp() * 3, x.sum()), "the test", th.device("cpu"))
-    with pytest.warns(RuntimeWarning, match="the test could not be compiled") as caught:
-        results = [compiled("key", x), compiled("key", x), compiled("other", x[:2])]
+    compiler = Compiler(th.device("cpu"))
+    one, two = (
+        Compiled(lambda x: (x.exp() * 3, x.sum()), f"test {k}", compiler) for k in ("one", "two")
+    )
+    with pytest.warns(RuntimeWarning, match="test one could not be compiled") as caught:
+        results = [one("key", x), one("key", x), one("other", x[:2]), two("key", x)]
     assert len(caught) == 1
-    for result, values in zip(results, (x, x, x[:2]), strict=True):
+    for result, values in zip(results, (x, x, x[:2], x), strict=True):
         assert all(map(th.equal, result, (values.exp() * 3, values.sum())))

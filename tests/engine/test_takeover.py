@@ -246,7 +246,7 @@ def test_a_compiled_policy_follows_the_running_statistics() -> None:
         if len(seen) == 2:  # as between two calls of learn()
             engine.release()
             engine.synchronize()
-    assert engine._runs_compiled()
+    assert engine.compiler.enabled
     assert not th.equal(seen[0], seen[1])
     assert not th.equal(seen[1], seen[2])
 
