@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -255,8 +255,7 @@ class EngineFlow(OffPolicyAlgorithm):
                 self._train_with_sb3(gradient_steps, batch_size)
                 return
             self._update_learning_rate(list(self.optimizers().values()))
-            for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
-                n_updates = min(MOST_DRAWN_AT_ONCE, gradient_steps - start)
+            for start, n_updates in in_parts(gradient_steps):
                 self._guard.before_updates()
                 batches = engine.draw(n_updates, batch_size)
                 losses = engine.train(batches, start).tolist()
@@ -438,3 +437,9 @@ def warn_of_stock_loop(reason: str) -> None:
         UserWarning,
         stacklevel=5,
     )
+
+
+def in_parts(gradient_steps: int) -> Iterator[tuple[int, int]]:
+    """Split updates into parts for which minibatches are drawn at once: start and number."""
+    for start in range(0, gradient_steps, MOST_DRAWN_AT_ONCE):
+        yield start, min(MOST_DRAWN_AT_ONCE, gradient_steps - start)

@@ -70,16 +70,9 @@ class BatchedVecEnv(VecEnv):
         """Take the step."""
         obs, rewards, terminated, truncated, batch = self.venv.step(self._actions)
         dones = terminated | truncated
-        infos = []
-        for i in range(self.num_envs):
-            if dones[i]:
-                info = info_of(batch["final_info"], i)
-                info["terminal_observation"] = batch["final_obs"][i]
-                self.reset_infos[i] = info_of(batch, i)
-            else:
-                info = info_of(batch, i)
-            info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
-            infos.append(info)
+        infos = [step_info(batch, i, terminated, truncated) for i in range(self.num_envs)]
+        for i in np.flatnonzero(dones).tolist():
+            self.reset_infos[i] = info_of(batch, i)
         return obs, np.asarray(rewards, np.float32), dones, infos
 
     def close(self) -> None:
@@ -110,6 +103,26 @@ class BatchedVecEnv(VecEnv):
     ) -> list[bool]:
         """Return False for each environment: wrappers apply to the whole batch."""
         return [False for _ in self._get_indices(indices)]
+
+
+def step_info(
+    batch: dict[str, Any], i: int, terminated: np.ndarray, truncated: np.ndarray
+) -> dict[str, Any]:
+    """Return one environment's info of a step, as SB3's ``VecEnv`` does.
+
+    Args:
+        batch: Infos of a step of gymnasium's ``VectorEnv`` that resets in the same step.
+        i: Index of the environment.
+        terminated: Which episodes terminated, (N,).
+        truncated: Which episodes were truncated, (N,).
+    """
+    if terminated[i] or truncated[i]:
+        info = info_of(batch.get("final_info", {}), i)
+        info["terminal_observation"] = batch["final_obs"][i]
+    else:
+        info = info_of(batch, i)
+    info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+    return info
 
 
 def info_of(infos: dict[str, Any], i: int) -> dict[str, Any]:

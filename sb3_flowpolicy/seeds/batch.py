@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import update_learning_rate
 
-from sb3_flowpolicy.algorithms.engine_flow import MOST_DRAWN_AT_ONCE, EngineFlow
+from sb3_flowpolicy.algorithms.engine_flow import EngineFlow, in_parts
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
 from sb3_flowpolicy.checkpoint.rows import Ring
 from sb3_flowpolicy.checkpoint.session import RunCheckpoints, load_agent, open_checkpoint
@@ -276,8 +276,7 @@ class SeedBatch:
             for model in self.models:
                 for optimizer in model.optimizers().values():
                     update_learning_rate(optimizer, rate)
-        for start in range(0, first.gradient_steps, MOST_DRAWN_AT_ONCE):
-            n_updates = min(MOST_DRAWN_AT_ONCE, first.gradient_steps - start)
+        for start, n_updates in in_parts(first.gradient_steps):
             self._guard.before_updates()
             batches = self._experience.minibatches(n_updates)
             self._losses = engine.train(batches, start).tolist()

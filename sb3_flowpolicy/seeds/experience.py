@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
-from sb3_flowpolicy.common.vec_env import info_of
+from sb3_flowpolicy.common.vec_env import step_info
 from sb3_flowpolicy.engine import EngineRuntime
 from sb3_flowpolicy.engine.replay import ReplayRows
 from sb3_flowpolicy.engine.update import Batch
@@ -128,10 +128,11 @@ class SeedExperience:
             first.policy.unscale_action(scaled)
         )
         step, dones, next_obs = first.num_timesteps + 1, terminated | truncated, obs
-        if dones.any():
+        done = np.flatnonzero(dones).tolist()
+        if done:
             # The environment has been reset already: the last observation is in the info.
             next_obs = obs.copy()
-            for index in np.flatnonzero(dones).tolist():
+            for index in done:
                 next_obs[index] = infos["final_obs"][index]
             check_experience({"final observations": next_obs}, step, self._name)
         check_experience({"observations": obs, "rewards": rewards}, step, self._name)
@@ -147,15 +148,10 @@ class SeedExperience:
         self._exploration.restart(dones)
         self.returns += rewards
         self.lengths += 1
-        ended = {
-            index: {
-                **self._end_of_episode(index, infos),
-                "terminal_observation": next_obs[index],
-                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
-            }
-            for index in np.flatnonzero(dones).tolist()
-        }
-        self.returns[dones], self.lengths[dones] = 0, 0
+        ended = {index: step_info(infos, index, terminated, truncated) for index in done}
+        for index, info in ended.items():
+            info["episode"] = self._episode(index, info)
+        self.returns[done], self.lengths[done] = 0, 0
         return rewards, dones, infos, ended
 
     def _act(self, runtime: EngineRuntime, obs: np.ndarray) -> np.ndarray:
@@ -182,16 +178,14 @@ class SeedExperience:
             buffer.pos = (row + 1) % buffer.buffer_size
             buffer.full = buffer.full or buffer.pos == 0
 
-    def _end_of_episode(self, index: int, infos: dict[str, Any]) -> dict[str, Any]:
-        """Return an agent's last info of an episode, with SB3's ``Monitor``'s entry."""
-        info = info_of(infos.get("final_info", {}), index)
-        info["episode"] = {
+    def _episode(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
+        """Return what SB3's ``Monitor`` says of an episode, given its last info."""
+        return {
             "r": round(float(self.returns[index]), 6),
             "l": int(self.lengths[index]),
             "t": round(time.time() - self._start, 6),
             **{name: info[name] for name in self.info_keywords},
         }
-        return info
 
     def record(self, ended: dict[int, dict[str, Any]]) -> None:
         """Record the episodes that :meth:`step` returned, as SB3's algorithms do."""

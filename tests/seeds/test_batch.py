@@ -290,7 +290,7 @@ def test_noise_is_drawn_in_any_number() -> None:
 
 def test_updates_are_drawn_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     def trained(most: int) -> np.ndarray:
-        monkeypatch.setattr("sb3_flowpolicy.seeds.batch.MOST_DRAWN_AT_ONCE", most)
+        monkeypatch.setattr("sb3_flowpolicy.algorithms.engine_flow.MOST_DRAWN_AT_ONCE", most)
         settings = {**FAST, "train_freq": 10, "gradient_steps": 10}
         batch = SeedBatch("FlowPolicy", ENV, 2, **settings).learn(60)
         assert batch.models[0]._n_updates == 30

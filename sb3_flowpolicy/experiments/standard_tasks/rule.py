@@ -21,7 +21,7 @@ The final value of a run is the mean return of its last two tests, or the share 
 the task has a goal. Differences from stock have a 95 % interval (Welch's) and are relative to
 stock's mean return, or absolute for successes. "better": the interval lies above 0. "not worse": it
 lies above -5 %. "worse": it lies below -5 %. Otherwise, and with fewer than five seeds:
-"undecided". That our policies are never worse than stock fails where the verdict is "worse"."""
+"undecided". Our policies are never worse than stock if no verdict is "worse"."""
 _TOLERANCE, _FEWEST_SEEDS = -0.05, 5
 
 
