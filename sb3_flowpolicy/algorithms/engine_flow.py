@@ -350,7 +350,7 @@ class EngineFlow(OffPolicyAlgorithm):
         if self.num_timesteps >= random_steps:
             engine = self._runtime.acting_engine() if self._runtime.is_running else None
             noise = self._exploration.next()
-        if engine is not None and engine.compiled:
+        if engine is not None and engine.compiled and not engine.networks.uses_gsde:
             obs = engine.networks.observations.pack(self._last_obs, self.device)
             if noise is not None:
                 noise = noise.to(engine.networks.actor.data).unsqueeze(0)

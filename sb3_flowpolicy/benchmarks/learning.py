@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -24,6 +24,8 @@ POLICIES = ("GaussPolicy", "LowRankPolicy", "FlowPolicy")
 # Steps per call of learn() and seed, enough to make the overhead of a call negligible.
 CHUNK = 500
 QUICK_START, QUICK_CHUNK = 50, 10
+# SB3 draws gSDE's noise once per rollout: with train_freq=1 it would be white.
+GSDE = {"use_sde": True, "train_freq": 8, "gradient_steps": 8}
 # Sizes as in rl_zoo3's settings, with SB3's tanh layers; rollouts on Pendulum-v1 are shorter.
 PPO_SETTINGS: dict[str, dict[str, Any]] = {
     "Pendulum-v1": {"n_envs": 4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
@@ -60,18 +62,10 @@ def stock_block(env_id: str) -> dict[str, Any]:
 def benchmarks(quick: bool = False) -> list[Benchmark]:
     """Return learning with SAC and PPO; ``quick`` neither compiles nor stacks seeds."""
     flowpolicy_envs.register_envs()
-    candidates = [Candidate("SB3 SAC", partial(_sac, SAC, stock_block(ENV_ID), quick))]
-    for algorithm in ("sac_gauss", "sac_flow"):
-        block = zoo_block(algorithm, ENV_ID) | {"compile": not quick}
-        name = algorithm + (", not compiled" if quick else "")
-        candidates.append(Candidate(name, partial(_sac, SACFlow, block, quick)))
-        if not quick:
-            stacked = partial(SeedBatch, seeds=range(N_SEEDS))
-            prepare = partial(_sac, stacked, block, n_seeds=N_SEEDS)
-            candidates.append(Candidate(f"SeedBatch of {N_SEEDS} {algorithm}", prepare))
     ppo = partial(PPOFlow, compile=not quick)
     return [
-        Benchmark(f"learn() on {ENV_ID}", "steps", candidates),
+        _on_tunnel(f"learn() on {ENV_ID}", ("sac_gauss", "sac_flow"), {}, quick),
+        _on_tunnel("the same with gSDE", ("sac_gauss",), GSDE, quick),
         *(
             Benchmark(
                 f"learn() of PPO on {env_id}",
@@ -87,6 +81,21 @@ def benchmarks(quick: bool = False) -> list[Benchmark]:
             for env_id in PPO_SETTINGS
         ),
     ]
+
+
+def _on_tunnel(
+    title: str, algorithms: Sequence[str], changes: dict[str, Any], quick: bool
+) -> Benchmark:
+    candidates = [Candidate("SB3 SAC", partial(_sac, SAC, stock_block(ENV_ID) | changes, quick))]
+    for algorithm in algorithms:
+        block = zoo_block(algorithm, ENV_ID) | {"compile": not quick, **changes}
+        name = algorithm + (", not compiled" if quick else "")
+        candidates.append(Candidate(name, partial(_sac, SACFlow, block, quick)))
+        if not quick:
+            stacked = partial(SeedBatch, seeds=range(N_SEEDS))
+            prepare = partial(_sac, stacked, block, n_seeds=N_SEEDS)
+            candidates.append(Candidate(f"SeedBatch of {N_SEEDS} {algorithm}", prepare))
+    return Benchmark(title, "steps", candidates)
 
 
 def with_hindsight(quick: bool = False) -> list[Benchmark]:

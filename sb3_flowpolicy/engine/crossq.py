@@ -43,6 +43,7 @@ class CrossQObjective(SACObjective):
     policy_delay: int = 3
     name: ClassVar[str] = "CrossQ"
     critic_type: ClassVar[type[nn.Module]] = CrossQCritic
+    gsde_actor_type: ClassVar[type[nn.Module] | None] = None
     layer_types: ClassVar[tuple[type[nn.Module], ...]] = (nn.Linear, BatchRenorm1d)
     networks_type: ClassVar[type[RenormNetworks]] = RenormNetworks
 

@@ -76,7 +76,8 @@ class Engine(BoundEngine):
         policy, objective = model.policy, model.objective()
         if objective is None:
             return f"the update of {type(model).__name__}"
-        if not isinstance(policy.actor, FlowActor):
+        has_gsde = type(policy.actor) is objective.gsde_actor_type and policy.actor.use_sde
+        if not (has_gsde or isinstance(policy.actor, FlowActor)):
             return f"actor of type {type(policy.actor).__name__}"
         if type(policy.critic) is not objective.critic_type:
             return f"critic of type {type(policy.critic).__name__}"
@@ -182,21 +183,19 @@ class Engine(BoundEngine):
 
     def draw(self, n_updates: int, batch_size: int) -> list[Batch]:
         """Draw minibatches and noise for ``n_updates`` updates at once."""
-        shape = (n_updates, 2, len(self.models), batch_size, self.networks.noise_dim)
-        data = self.networks.actor.data
         buffers = [model.replay_buffer for model in self.models]
         if all(map(_can_be_rows, self.models)):
             if self._rows is None or not self._rows.holds(buffers):
                 self._rows = ReplayRows(buffers)
             index = draw_index(buffers, n_updates, batch_size)
-            noise = th.randn(shape, dtype=data.dtype, device=data.device)
+            noise = self.networks.draw_noise(n_updates, batch_size)
             return self._rows.take(index, self.models[0].gamma, noise)
         columns = [
             sample_columns(model, self.networks.observations, n_updates, batch_size)
             for model in self.models
         ]
         stacked = [th.cat(parts, dim=1) for parts in zip(*columns, strict=True)]
-        noise = th.randn(shape, dtype=data.dtype, device=data.device)
+        noise = self.networks.draw_noise(n_updates, batch_size)
         return [Batch(*(part[k] for part in (*stacked, noise))) for k in range(n_updates)]
 
     def train(self, batches: Sequence[Batch], start: int = 0) -> th.Tensor:

@@ -11,6 +11,7 @@ from torch import nn
 from torch.func import functional_call, vmap
 from torch.utils._pytree import tree_leaves, tree_map
 
+from sb3_flowpolicy.engine import gsde
 from sb3_flowpolicy.engine.flat import FlatParameters, Layout
 from sb3_flowpolicy.engine.observations import Observations
 from sb3_flowpolicy.policies import FlowActor
@@ -29,15 +30,19 @@ class StackedNetworks:
 
     def __init__(self, policies: Sequence[Any], autocast: bool) -> None:
         first = policies[0]
-        assert isinstance(first.actor, FlowActor)
         self.autocast = autocast
         self.actor = FlatParameters([_actor_layout(policy) for policy in policies])
         self.critic = FlatParameters([_critic_layout(policy.critic) for policy in policies], True)
         #: Further parameters that an update changes: those of the target networks.
         self.others = self._others(policies)
-        self.noise_dim = first.actor.density.noise_dim
+        self.uses_gsde = not isinstance(first.actor, FlowActor)
+        self.noise_dim = noise_shape(first.actor, 1)[-1]
         self.observations = Observations(first.observation_space)
-        self._sampler = AsForward(first.actor, self._action_log_prob)
+        if self.uses_gsde:
+            self._action_log_prob = partial(gsde.action_log_prob, first.actor)
+        else:
+            self._action_log_prob = first.actor.action_log_prob
+        self._sampler = AsForward(first.actor, self._sample)
         self._actor, self._critic = first.actor, first.critic
 
     def _others(self, policies: Sequence[Any]) -> list[FlatParameters]:
@@ -48,6 +53,14 @@ class StackedNetworks:
     def acting(self) -> list[FlatParameters]:
         """What :meth:`sample` reads."""
         return [self.actor]
+
+    def draw_noise(self, n_updates: int, batch_size: int) -> th.Tensor:
+        """Draw the standard normals of updates, (n, 2, S, B, M)."""
+        data = self.actor.data
+        n_draws, *rows = noise_shape(self._actor, batch_size)
+        shape = (n_updates, n_draws, len(data), *rows)
+        noise = th.randn(shape, dtype=data.dtype, device=data.device)
+        return noise.expand(-1, 2, -1, -1, -1)
 
     def sample(
         self, actor: th.Tensor, obs: th.Tensor, noise: th.Tensor
@@ -62,8 +75,8 @@ class StackedNetworks:
             actions, log_prob = per_seed(sample, parameters, (obs, noise))
         return actions.to(actor.dtype), log_prob.to(actor.dtype)
 
-    def _action_log_prob(self, obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return self._actor.action_log_prob(self.observations.unpack(obs), noise)
+    def _sample(self, obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        return self._action_log_prob(self.observations.unpack(obs), noise)
 
     def q_values(
         self,
@@ -96,6 +109,17 @@ class StackedNetworks:
                 else:
                     hidden = layer(hidden)
         return hidden.to(critic.dtype)
+
+
+def noise_shape(actor: Any, batch_size: int) -> tuple[int, int, int]:
+    """Return the shape of the standard normals that an update of one seed draws: (2, B, M).
+
+    The first are for the states of a minibatch, the others for the next states. With gSDE, all
+    have one exploration matrix: (1, 1, M).
+    """
+    if isinstance(actor, FlowActor):
+        return 2, batch_size, actor.density.noise_dim
+    return 1, 1, gsde.noise_dim(actor)
 
 
 def per_seed(function: Callable[..., Any], *arguments: Any) -> Any:

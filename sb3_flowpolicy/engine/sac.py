@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from sb3_flowpolicy.engine.update import Objective
@@ -32,6 +33,7 @@ class SACObjective(Objective):
     critic_loss_coef: float = SB3_CRITIC_LOSS_COEF
     name: ClassVar[str] = "SAC"
     critic_type: ClassVar[type[nn.Module]] = ContinuousCritic
+    gsde_actor_type: ClassVar[type[nn.Module] | None] = Actor
 
     def next_values(self, outputs: th.Tensor) -> th.Tensor:
         """Return the smallest value of the target critics, (S, B, 1)."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch as th
-from sb3_contrib.tqc.policies import Critic
+from sb3_contrib.tqc.policies import Actor, Critic
 from torch import nn
 
 from sb3_flowpolicy.engine.update import Objective
@@ -35,6 +35,7 @@ class TQCObjective(Objective):
     dropped: int
     name: ClassVar[str] = "TQC"
     critic_type: ClassVar[type[nn.Module]] = Critic
+    gsde_actor_type: ClassVar[type[nn.Module] | None] = Actor
 
     def next_values(self, outputs: th.Tensor) -> th.Tensor:
         """Return the smallest C (N - dropped) quantiles of the target critics, (S, B, T)."""

@@ -140,6 +140,8 @@ class Objective(ABC):
     """The algorithm's name, for messages."""
     critic_type: ClassVar[type[nn.Module]]
     """Class of the critics."""
+    gsde_actor_type: ClassVar[type[nn.Module] | None] = None
+    """Class of the stock actors with gSDE (``use_sde=True``), None if they are not supported."""
     layer_types: ClassVar[tuple[type[nn.Module], ...]] = (nn.Linear,)
     """Types of the critics' layers that have parameters."""
     networks_type: ClassVar[type[StackedNetworks]] = StackedNetworks

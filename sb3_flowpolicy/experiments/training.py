@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from filelock import FileLock, Timeout
-from stable_baselines3.common.monitor import Monitor
 
 from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.sac_flow import SACFlow
@@ -20,7 +19,6 @@ from sb3_flowpolicy.experiments import measures
 from sb3_flowpolicy.experiments.store import ItemFiles
 from sb3_flowpolicy.experiments.work import WorkItem, environment
 from sb3_flowpolicy.seeds.batch import SeedBatch
-from sb3_flowpolicy.seeds.setup import make_env
 
 Report = Callable[[str, int], None]
 """Called with an item's key and the steps that each of its seeds has done."""
@@ -59,7 +57,7 @@ def run_item(item: WorkItem, folder: Path, report: Report) -> None:
 
 
 class _Training:
-    """Trains all seeds in lockstep, or one after the other.
+    """Trains all seeds in lockstep.
 
     Training is a sequence of stages, each followed by a measurement. The first agent carries what
     the item's files held when the stage began. A resumed run cuts the files to that, finishes the
@@ -69,9 +67,6 @@ class _Training:
     def __init__(self, item: WorkItem, files: ItemFiles, report: Report) -> None:
         self.item, self.files, self.report = item, files, report
         self.env = environment(item)
-        # gSDE is not a density but part of SB3's actor, so its seeds cannot be stacked.
-        self.stacked = not item.hyperparameters.get("use_sde")
-        self.groups = [item.seeds] if self.stacked else [(seed,) for seed in item.seeds]
         self.infos = [name for name in measures.TRAINING_INFOS if name in item.measures]
         self.started, self.cpu_started = time.perf_counter(), time.process_time()
         # Totals of earlier sessions.
@@ -80,12 +75,10 @@ class _Training:
         self.machine = machine()
 
     def run(self) -> None:
-        begun = [k for k in range(len(self.groups)) if any(self._folder(k).glob("*-step-*"))]
-        if not begun:
+        resumed = any(self.files.checkpoints.glob("*-step-*"))
+        if not resumed:
             self.files.cut_to({"table": 0, "details": 0})
-        steps = 0
-        for k in range(begun[-1] if begun else 0, len(self.groups)):
-            steps = self._train(k, resumed=k in begun)
+        steps = self._train(resumed)
         totals, seeds = self._totals(), self.item.seeds
         facts = {
             "steps": steps,
@@ -98,17 +91,14 @@ class _Training:
         }
         self.files.finish({**facts, **self.files.fingerprint(), "machine": self.machine})
 
-    def _folder(self, group: int) -> Path:
-        return self.files.checkpoints / f"group-{group}"
-
-    def _train(self, group: int, resumed: bool) -> int:
-        """Train a group of seeds to its end, and return the steps that it has done."""
+    def _train(self, resumed: bool) -> int:
+        """Train the seeds to their end, and return the steps that each has done."""
         item = self.item
-        learner = self._resume(group) if resumed else self._begin(group)
-        models = learner.models if isinstance(learner, SeedBatch) else [learner]
+        batch = self._resume() if resumed else self._begin()
+        models = batch.models
         stage = vars(models[0]).get(_PROGRESS, {"start": 0})["start"]
-        self._tell(group, stage)
-        tests = measures.DeterministicEpisodes(self.env, self.groups[group], item.test_episodes)
+        self.report(item.key, stage)
+        tests = measures.DeterministicEpisodes(self.env, item.seeds, item.test_episodes)
         first = True
         while stage < item.steps:
             end = min(stage + item.eval_every, item.steps)
@@ -120,60 +110,44 @@ class _Training:
                 vars(models[0])[_PROGRESS] = progress
                 # More steps than the run has: the only checkpoint is that at the end of the call.
                 every = 2 * item.steps if due else None
-                learner.learn(
+                batch.learn(
                     # The first call counts from zero, that of a resumed run included.
                     end if first else end - stage,
                     log_interval=_NO_LOGS,
                     reset_num_timesteps=first,
                     checkpoint_every=every,
-                    checkpoint_path=self._folder(group) if due else None,
+                    checkpoint_path=self.files.checkpoints if due else None,
                 )
                 first = False
             done = models[0].num_timesteps
             tested = zip(models, tests.run(models), tests.run(models, "log_prob"), strict=True)
             self.files.append_rows([self._row(*one) for one in tested])
-            if group == 0 and any(stage < at <= done for at in item.pictures_at):
+            if any(stage < at <= done for at in item.pictures_at):
                 self._record("picture", measures.policy_picture, models[:1])
             stage = done
-            self._tell(group, stage)
+            self.report(item.key, stage)
         if "profile" in item.measures:
             self._record("profile", measures.entropy_profile, models)
         tests.venv.close()
-        if group == 0:
-            # Kept to draw pictures of it; saved before the item is declared complete.
-            self.files.agent.parent.mkdir(exist_ok=True)
-            models[0].save(self.files.agent)
+        # Kept to draw pictures of it; saved before the item is declared complete.
+        self.files.agent.parent.mkdir(exist_ok=True)
+        models[0].save(self.files.agent)
         return stage
 
-    def _begin(self, group: int) -> SeedBatch | SACFlow:
+    def _begin(self) -> SeedBatch:
         settings = {"device": "cpu", **self.item.hyperparameters}
         settings |= {"stats_window_size": _ALL_EPISODES}
-        policy = settings.pop("policy")
-        if self.stacked:
-            settings.setdefault("compile", self.item.updates >= UPDATES_WORTH_COMPILING)
-            return SeedBatch(
-                policy, self.env, self.groups[group], info_keywords=self.infos, **settings
-            )
-        settings["compile"] = False
-        return SACFlow(policy, self._monitored(), seed=self.groups[group][0], **settings)
+        settings.setdefault("compile", self.item.updates >= UPDATES_WORTH_COMPILING)
+        return SeedBatch(env=self.env, seeds=self.item.seeds, info_keywords=self.infos, **settings)
 
-    def _resume(self, group: int) -> SeedBatch | SACFlow:
+    def _resume(self) -> SeedBatch:
         try:
-            path = self._folder(group)
-            learner: SeedBatch | SACFlow = (
-                SeedBatch.resume(path, self.env, info_keywords=self.infos)
-                if self.stacked
-                else SACFlow.resume(path, self._monitored(), device="cpu")
-            )
+            batch = SeedBatch.resume(self.files.checkpoints, self.env, info_keywords=self.infos)
         except ValueError as error:
             raise ValueError(f"{error}: {self.files.advice}") from error
-        first = learner.models[0] if isinstance(learner, SeedBatch) else learner
-        self.before = vars(first)[_PROGRESS]
+        self.before = vars(batch.models[0])[_PROGRESS]
         self.files.cut_to(self.before["files"])
-        return learner
-
-    def _monitored(self) -> Monitor:
-        return Monitor(make_env(self.env), info_keywords=tuple(self.infos))
+        return batch
 
     def _totals(self) -> dict[str, Any]:
         """Return time, number and commits of all sessions so far."""
@@ -184,9 +158,6 @@ class _Training:
             "sessions": self.before["sessions"] + 1,
             "commits": [*self.before["commits"], self.machine["commit"]],
         }
-
-    def _tell(self, group: int, steps: int) -> None:
-        self.report(self.item.key, (group * self.item.steps + steps) // len(self.groups))
 
     def _row(
         self,

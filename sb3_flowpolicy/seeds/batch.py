@@ -33,6 +33,7 @@ CallbackFactory = Callable[[int], BaseCallback]
 _COMMON = (
     *("batch_size", "gamma", "learning_starts", "random_steps", "train_freq", "gradient_steps"),
     *("action_noise_color", "action_noise_correlation_time", "target_update_interval"),
+    *("use_sde", "sde_sample_freq", "use_sde_at_warmup"),
 )
 # Schedules are functions, which cannot be compared; their values at these shares of training can.
 _SCHEDULE_AT = (1.0, 0.5, 0.0)
@@ -240,7 +241,11 @@ class SeedBatch:
                 break
             for one in callbacks.values():
                 one.on_rollout_start()
-            for _ in range(first.train_freq.frequency):
+            n_steps = first.train_freq.frequency
+            keep = first.sde_sample_freq if first.sde_sample_freq > 0 else n_steps
+            for step in range(n_steps):
+                if first.use_sde and step % keep == 0:
+                    self._experience.draw_matrices()
                 going = going and self._step(callbacks, log_interval)
             for one in callbacks.values():
                 one.on_rollout_end()

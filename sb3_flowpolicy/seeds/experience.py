@@ -16,6 +16,7 @@ from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
 from sb3_flowpolicy.common.vec_env import step_info
 from sb3_flowpolicy.engine import EngineRuntime
+from sb3_flowpolicy.engine.networks import noise_shape
 from sb3_flowpolicy.engine.replay import ReplayRows
 from sb3_flowpolicy.engine.update import Batch
 from sb3_flowpolicy.guard.finite import check_experience
@@ -52,6 +53,8 @@ class SeedExperience:
         self.rows = ReplayRows(self._buffers())
         self._exploration = ColoredExploration()
         self._noise: dict[str, SeedNoise] = {}
+        # With gSDE, the noise that several steps share.
+        self._matrices: th.Tensor | None = None
         self.fit()
         # Returns and lengths of the running episodes.
         self.returns, self.lengths = np.zeros(len(seeds)), np.zeros(len(seeds), dtype=int)
@@ -81,14 +84,17 @@ class SeedExperience:
         if not self.rows.holds(buffers):
             self.rows = ReplayRows(buffers)
         first, before = self.models[0], self._noise
-        noise_dim, shape = first.actor.density.noise_dim, first.action_space.shape or ()
+        of_update, shape = (
+            noise_shape(first.actor, first.batch_size),
+            first.action_space.shape or (),
+        )
         self._exploration.fit(first, len(self.seeds), self.venv)
         process = self._exploration.process
         # Name -> shape, and whether it is uniform. Generators that still fit continue.
         wanted = {
             "random actions": (shape, True),
-            "actions": ((1, noise_dim) if process is None else process.white_shape[1:], False),
-            "updates": ((2, first.batch_size, noise_dim), False),
+            "actions": ((1, of_update[-1]) if process is None else process.white_shape[1:], False),
+            "updates": (of_update, False),
             "rows": ((first.batch_size,), True),
         }
         self._noise = {
@@ -154,13 +160,18 @@ class SeedExperience:
         self.returns[done], self.lengths[done] = 0, 0
         return rewards, dones, infos, ended
 
+    def draw_matrices(self) -> None:
+        """Draw new exploration matrices, with which agents that use gSDE act from now on."""
+        self._matrices = self._noise["actions"].draw()[0]
+
     def _act(self, runtime: EngineRuntime, obs: np.ndarray) -> np.ndarray:
         """Return scaled actions, (S, *shape)."""
         first = self.models[0]
         random_steps = first.learning_starts if first.random_steps is None else first.random_steps
-        if first.num_timesteps < random_steps:
+        with_gsde_first = first.use_sde and first.use_sde_at_warmup
+        if first.num_timesteps < random_steps and not with_gsde_first:
             return (self._noise["random actions"].draw()[0] * 2 - 1).float().numpy()
-        noise = self._noise["actions"].draw()[0]
+        noise = self._noise["actions"].draw()[0] if self._matrices is None else self._matrices
         if self._exploration.process is not None:
             noise = self._exploration.process.step(noise).unsqueeze(1)
         engine = runtime.engine()
@@ -201,7 +212,7 @@ class SeedExperience:
         first, seeds = self.rows.buffers[0], len(self.seeds)
         rows = (self._noise["rows"].draw(count) * first.size()).long()
         index = rows.mul_(seeds).add_(th.arange(seeds).unsqueeze(-1))
-        noise = self._noise["updates"].draw(count).transpose(1, 2)
+        noise = self._noise["updates"].draw(count).transpose(1, 2).expand(-1, 2, -1, -1, -1)
         return self.rows.take(index, self.models[0].gamma, noise)
 
     def _name(self, index: int) -> str:

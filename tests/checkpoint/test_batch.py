@@ -40,15 +40,29 @@ def learn(batch: SeedBatch, folder: Path, step: int | None, **checkpoints: Any) 
     return callbacks
 
 
+FLOW = {"policy": "FlowPolicy"}
+GSDE = {"policy": "GaussPolicy", "use_sde": True}
+
+
 @pytest.mark.parametrize(
-    "env", ["TunnelDiagonal-v0", "SquareHold-v0", short_pendulum], ids=["Tunnel", "Square", "sync"]
+    ("env", "settings"),
+    [
+        ("TunnelDiagonal-v0", FLOW),
+        ("SquareHold-v0", FLOW),
+        (short_pendulum, FLOW),
+        (short_pendulum, GSDE),
+    ],
+    ids=["Tunnel", "Square", "sync", "gSDE"],
 )
-def test_resumed_batch_is_the_undisturbed_one(env: Any, tmp_path: Path) -> None:
-    calm = SeedBatch("FlowPolicy", env, SEEDS, monitor_dir=tmp_path / "calm", **FAST)
+def test_resumed_batch_is_the_undisturbed_one(
+    env: Any, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    settings = {"env": env, "seeds": SEEDS, **FAST, **settings}
+    calm = SeedBatch(monitor_dir=tmp_path / "calm", **settings)
     learn(calm, tmp_path / "calm", None)
     folder = tmp_path / "broken"
     checkpoints: dict[str, Any] = {"checkpoint_every": 20, "checkpoint_path": folder / "run"}
-    batch = SeedBatch("FlowPolicy", env, SEEDS, monitor_dir=folder, **FAST)
+    batch = SeedBatch(monitor_dir=folder, **settings)
     learn(batch, folder, 67, **checkpoints)
     for step in (128, None, None):
         batch = SeedBatch.resume(folder / "run", env, monitor_dir=folder)

@@ -144,9 +144,13 @@ def test_action_noise_goes_on(tmp_path: Path) -> None:
     assert differences(calm, resumed) == []
 
 
-def test_state_dependent_exploration_on_sb3s_own_loop(tmp_path: Path) -> None:
+def test_sb3s_own_loop(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="the stock loop"):
-        assert compare(lambda: gym.make(ENV), tmp_path, policy=SACPolicy, use_sde=True) == []
+        assert compare(lambda: gym.make(ENV), tmp_path, policy=SACPolicy) == []
+
+
+def test_state_dependent_exploration(tmp_path: Path) -> None:
+    assert compare(lambda: gym.make(ENV), tmp_path, policy=SACPolicy, use_sde=True) == []
 
 
 def test_hindsight_replay(tmp_path: Path) -> None:

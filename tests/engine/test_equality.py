@@ -212,17 +212,65 @@ def test_stacked_update_equals_single_ones(policy: str, ent_coef: Any, dtype: th
     check_stacked(SACFlow, policy, ent_coef, dtype)
 
 
+def train_on_drawn(model: Any) -> list[Batch]:
+    """Train our model and return its minibatches, for the stock loop to use."""
+    with model._runtime.running():
+        engine = model._runtime.engine()
+        batches = engine.draw(N_UPDATES, BATCH_SIZE)
+        engine.draw = lambda *_: batches
+        model.train(N_UPDATES, batch_size=BATCH_SIZE)
+        assert engine.compiler.enabled == engine.compiled == model.compile
+    return batches
+
+
+def sample_these(model: Any, batches: list[Batch]) -> None:
+    flat = [[column[0].reshape(BATCH_SIZE, -1) for column in batch[:-1]] for batch in batches]
+    remaining = iter([ReplayBufferSamples(*columns) for columns in flat])
+    model.replay_buffer.sample = lambda *_, **__: next(remaining)
+
+
+@pytest.mark.parametrize(
+    ("stock_algorithm", "dtype", "use_expln", "compile"),
+    [
+        (SAC, th.float32, False, False),
+        (SAC, th.float32, False, True),
+        (SAC, th.float64, True, False),
+        (TQC, th.float64, False, False),
+    ],
+)
+def test_gsde_equals_sb3(
+    stock_algorithm: Any, dtype: th.dtype, use_expln: bool, compile: bool
+) -> None:
+    settings = {"use_sde": True, "policy_kwargs": {"net_arch": [16], "use_expln": use_expln}}
+    stock = make(stock_algorithm, "MlpPolicy", dtype, **settings)
+    ours = make(OURS[stock_algorithm], "GaussPolicy", dtype, compile=compile, **settings)
+    ours.policy.load_state_dict(stock.policy.state_dict())
+    batches = train_on_drawn(ours)
+
+    density, noise = stock.actor.action_dist, iter([batch.noise for batch in batches])
+    density.bijector.epsilon = 0.0  # SB3 adds 1e-6 inside a logarithm
+
+    def sample_weights(log_std: th.Tensor, batch_size: int = 1) -> None:
+        of_states, of_next_states = next(noise)
+        assert th.equal(of_states, of_next_states)
+        std = density.get_std(log_std)
+        density.exploration_mat = std * of_states.reshape(std.shape)
+
+    density.sample_weights = sample_weights
+    sample_these(stock, batches)
+    stock.train(N_UPDATES, BATCH_SIZE)
+    assert_same(ours, stock, dtype)
+
+
 def crossq_loop(model: CrossQ, batches: list[Batch]) -> None:
     """Run sb3-contrib's loop on our minibatches and noise."""
-    samples, noise = [], []
+    noise = []
     for k, batch in enumerate(batches, 1):
-        flat = [column[0].reshape(BATCH_SIZE, -1) for column in batch[:-1]]
-        samples.append(ReplayBufferSamples(*flat))
         # Next actions come first; the actor is not updated every time.
         noise += [batch.noise[1, 0]] + ([batch.noise[0, 0]] if k % model.policy_delay == 0 else [])
-    remaining, drawn = iter(samples), iter(noise)
-    model.replay_buffer.sample = lambda *_, **__: next(remaining)  # type: ignore[union-attr, method-assign]
+    drawn = iter(noise)
     model.actor.density.draw_noise = lambda context: next(drawn)  # type: ignore[assignment]
+    sample_these(model, batches)
     model.train(len(batches), BATCH_SIZE)
 
 
@@ -247,14 +295,12 @@ def test_crossq_equals_sb3_contribs(
     stock = make(CrossQ, policy, dtype, **settings)
     ours = make(CrossQFlow, policy, dtype, compile=compile, **settings)
     ours.policy.load_state_dict(stock.policy.state_dict())
-    with ours._runtime.running():
-        engine = ours._runtime.engine()
-        batches = engine.draw(N_UPDATES, BATCH_SIZE)
-        engine.draw = lambda *_: batches
-        ours.train(N_UPDATES, BATCH_SIZE)
-        assert engine.compiler.enabled == compile
-    crossq_loop(stock, batches)
+    crossq_loop(stock, train_on_drawn(ours))
     assert_same(ours, stock, dtype)
+
+
+def test_stacked_update_with_gsde_equals_single_ones() -> None:
+    check_stacked(SACFlow, "GaussPolicy", "auto", th.float64, use_sde=True)
 
 
 @pytest.mark.parametrize("algorithm", [TQCFlow, CrossQFlow])
@@ -263,9 +309,9 @@ def test_stacked_updates_of_others_equal_single_ones(algorithm: Any) -> None:
 
 
 def check_stacked(
-    algorithm: Any, policy: str, ent_coef: Any, dtype: th.dtype, n_seeds: int = 4
+    algorithm: Any, policy: str, ent_coef: Any, dtype: th.dtype, n_seeds: int = 4, **settings: Any
 ) -> None:
-    settings = {"ent_coef": ent_coef}
+    settings["ent_coef"] = ent_coef
     settings["policy_kwargs"] = {"optimizer_kwargs": {"weight_decay": 2.5e-4}}
 
     def models() -> list[Any]:

@@ -17,6 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
+from sb3_flowpolicy.engine import Engine
 from sb3_flowpolicy.seeds.experience import SeedNoise
 from tests.reach import make_reach
 
@@ -311,6 +312,40 @@ def test_learns_what_a_single_agent_learns() -> None:
     for model in batch.models:
         action, _ = model.predict(np.zeros(2, dtype=np.float32), deterministic=True)
         assert action.min() > 0.7
+
+
+@pytest.mark.parametrize(("sde_sample_freq", "steps_alike"), [(-1, 6), (4, 4)])
+def test_gsde_keeps_its_matrices(
+    sde_sample_freq: int, steps_alike: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in SB3: for a rollout, unless there is a frequency, which begins anew with a rollout."""
+    settings = {**FAST, "train_freq": 6, "gradient_steps": 1, "sde_sample_freq": sde_sample_freq}
+    batch = SeedBatch("GaussPolicy", ENV, 2, use_sde=True, use_sde_at_warmup=True, **settings)
+    matrices, act = [], Engine.act
+
+    def acting(engine: Engine, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        matrices.append(noise)
+        return act(engine, obs, noise)
+
+    monkeypatch.setattr(Engine, "act", acting)
+    batch.learn(36)
+    assert len(matrices) == 36  # at warm-up, too
+    for step in range(1, 36):
+        is_new = step % 6 % steps_alike == 0
+        assert th.equal(matrices[step], matrices[step - 1]) != is_new
+    assert all((one[0] != one[1]).all() for one in matrices)
+
+
+def test_gsde_acts_as_sb3s_actor() -> None:
+    batch = SeedBatch("GaussPolicy", "Pendulum-v1", 2, use_sde=True, **FAST).learn(60)
+    obs, noise = th.randn(2, 1, 3), th.randn(2, 1, 16)
+    with batch._runtime.running():
+        got = batch._runtime.engine().act(obs, noise)
+    for model, own_obs, own_noise, own_action in zip(batch.models, obs, noise, got, strict=True):
+        density = model.actor.action_dist
+        std = density.get_std(model.actor.log_std)
+        density.exploration_mat = std * own_noise.reshape(std.shape)
+        th.testing.assert_close(own_action, model.actor(own_obs).detach())
 
 
 @pytest.mark.parametrize(
