@@ -39,8 +39,9 @@ def action_log_prob(actor: Any, obs: PyTorchObs, noise: th.Tensor) -> tuple[th.T
     mean, log_std, features = actor.get_action_dist_params(obs)
     latent, density = features["latent_sde"], actor.action_dist
     std = density.get_std(log_std)
-    unsquashed = mean + latent @ (std * noise.reshape(std.shape))
-    variance = latent.square() @ std.square() + density.epsilon
-    normal = Normal(mean, variance.sqrt(), validate_args=False)
-    log_prob = normal.log_prob(unsquashed).sum(-1)
-    return unsquashed.tanh(), log_prob - tanh_ladj(unsquashed)
+    # In the noise's type, as autocast makes the products bfloat16.
+    offset = (latent @ (std * noise.reshape(std.shape))).to(noise)
+    variance = (latent.square() @ std.square()).to(noise) + density.epsilon
+    normal = Normal(th.zeros_like(offset), variance.sqrt(), validate_args=False)
+    unsquashed = mean + offset
+    return unsquashed.tanh(), normal.log_prob(offset).sum(-1) - tanh_ladj(unsquashed)

@@ -360,9 +360,20 @@ def test_updating_seeds_in_groups_changes_nothing(
         assert_close(everything(got), everything(wanted), th.float32)
 
 
-@pytest.mark.parametrize("policy", ["GaussPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY])
-def test_autocast_rounds_products_and_nothing_else(policy: str) -> None:
-    exact, rounded = (make(SACFlow, policy, th.float32, autocast=on) for on in (False, True))
+@pytest.mark.parametrize(
+    ("policy", "use_sde"),
+    [
+        ("GaussPolicy", True),
+        *(
+            (name, False)
+            for name in ("GaussPolicy", "LowRankPolicy", "FlowPolicy", *WITHOUT_POLICY)
+        ),
+    ],
+)
+def test_autocast_rounds_products_and_nothing_else(policy: str, use_sde: bool) -> None:
+    exact, rounded = (
+        make(SACFlow, policy, th.float32, autocast=on, use_sde=use_sde) for on in (False, True)
+    )
     rounded.policy.load_state_dict(exact.policy.state_dict())
     for model in (exact, rounded):
         seed_everything()
