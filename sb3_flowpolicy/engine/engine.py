@@ -79,6 +79,8 @@ class Engine(BoundEngine):
         has_gsde = type(policy.actor) is objective.gsde_actor_type and policy.actor.use_sde
         if not (has_gsde or isinstance(policy.actor, FlowActor)):
             return f"actor of type {type(policy.actor).__name__}"
+        if model.use_sde != policy.actor.use_sde:
+            return f"use_sde={model.use_sde} with an actor made with use_sde={not model.use_sde}"
         if type(policy.critic) is not objective.critic_type:
             return f"critic of type {type(policy.critic).__name__}"
         space = model.observation_space

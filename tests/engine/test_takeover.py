@@ -147,6 +147,16 @@ def test_frozen_parameters_and_hooks_are_left_to_sb3() -> None:
     assert len(calls) == 2
 
 
+def test_gsde_that_was_switched_off_is_left_to_sb3() -> None:
+    """SB3 then keeps its exploration matrix, which the engine would draw anew."""
+    model = make(SACFlow, "GaussPolicy", th.float32, use_sde=True)
+    model.use_sde = False
+    before = model.actor.action_dist.exploration_mat
+    with pytest.warns(UserWarning, match="use_sde=False with an actor made with use_sde=True"):
+        model.train(1, batch_size=BATCH_SIZE)
+    assert model.actor.action_dist.exploration_mat is before
+
+
 def test_assigned_parameters_without_an_optimizer_are_left_to_sb3() -> None:
     model = make(SACFlow, "GaussPolicy", th.float32, compile=False)
     model.train(2, batch_size=BATCH_SIZE)

@@ -348,6 +348,15 @@ def test_gsde_acts_as_sb3s_actor() -> None:
         th.testing.assert_close(own_action, model.actor(own_obs).detach())
 
 
+def test_gsde_that_was_switched_on_or_off_is_refused() -> None:
+    for policy, use_sde in (("FlowPolicy", False), ("GaussPolicy", True)):
+        batch = SeedBatch(policy, ENV, 2, use_sde=use_sde, **FAST)
+        for model in batch.models:
+            model.use_sde = not use_sde
+        with pytest.raises(ValueError, match=f"use_sde={not use_sde} with an actor made with use_"):
+            batch.learn(40)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
