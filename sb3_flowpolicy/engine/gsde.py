@@ -16,6 +16,15 @@ def noise_dim(actor: Any) -> int:
     return actor.action_dist.latent_sde_dim * actor.action_dist.action_dim
 
 
+@th.no_grad()
+def set_matrix(actor: Any, noise: th.Tensor) -> None:
+    """Let an actor explore with the matrix of given standard normals, (1, H D)."""
+    density = actor.action_dist
+    std = density.get_std(actor.log_std)
+    density.exploration_mat = std * noise.reshape(std.shape)
+    density.exploration_matrices = density.exploration_mat.unsqueeze(0)
+
+
 def action_log_prob(actor: Any, obs: PyTorchObs, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     r"""Sample actions and score them, as SB3's ``action_log_prob`` does with a given matrix.
 

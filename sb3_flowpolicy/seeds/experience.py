@@ -15,7 +15,7 @@ from sb3_flowpolicy.algorithms.engine_flow import EngineFlow
 from sb3_flowpolicy.algorithms.exploration import ColoredExploration
 from sb3_flowpolicy.checkpoint.logs import read_texts, write_texts
 from sb3_flowpolicy.common.vec_env import step_info
-from sb3_flowpolicy.engine import EngineRuntime
+from sb3_flowpolicy.engine import EngineRuntime, gsde
 from sb3_flowpolicy.engine.networks import noise_shape
 from sb3_flowpolicy.engine.replay import ReplayRows
 from sb3_flowpolicy.engine.update import Batch
@@ -84,10 +84,8 @@ class SeedExperience:
         if not self.rows.holds(buffers):
             self.rows = ReplayRows(buffers)
         first, before = self.models[0], self._noise
-        of_update, shape = (
-            noise_shape(first.actor, first.batch_size),
-            first.action_space.shape or (),
-        )
+        shape = first.action_space.shape or ()
+        of_update = noise_shape(first.actor, first.batch_size)
         self._exploration.fit(first, len(self.seeds), self.venv)
         process = self._exploration.process
         # Name -> shape, and whether it is uniform. Generators that still fit continue.
@@ -163,6 +161,9 @@ class SeedExperience:
     def draw_matrices(self) -> None:
         """Draw new exploration matrices, with which agents that use gSDE act from now on."""
         self._matrices = self._noise["actions"].draw()[0]
+        # For ``predict``: in callbacks, and after training.
+        for model, noise in zip(self.models, self._matrices, strict=True):
+            gsde.set_matrix(model.actor, noise)
 
     def _act(self, runtime: EngineRuntime, obs: np.ndarray) -> np.ndarray:
         """Return scaled actions, (S, *shape)."""

@@ -348,6 +348,26 @@ def test_gsde_acts_as_sb3s_actor() -> None:
         th.testing.assert_close(own_action, model.actor(own_obs).detach())
 
 
+def test_agents_with_gsde_predict_with_the_matrices_that_the_batch_acts_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = {**FAST, "gradient_steps": 0, "random_steps": 0, "train_freq": 8}
+    batch = SeedBatch("GaussPolicy", "Pendulum-v1", 2, use_sde=True, **settings)
+    for model in batch.models:  # agents are made with other matrices and deviations
+        model.actor.log_std.data.fill_(0.5)
+    calls, act = [], Engine.act
+
+    def acting(engine: Engine, obs: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        calls.append((obs, act(engine, obs, noise)))
+        return calls[-1][1]
+
+    monkeypatch.setattr(Engine, "act", acting)
+    batch.learn(16)
+    for model, obs, scaled in zip(batch.models, *calls[-1], strict=True):
+        action, _ = model.predict(obs.numpy())
+        np.testing.assert_allclose(model.policy.scale_action(action), scaled, atol=1e-5)
+
+
 def test_gsde_that_was_switched_on_or_off_is_refused() -> None:
     for policy, use_sde in (("FlowPolicy", False), ("GaussPolicy", True)):
         batch = SeedBatch(policy, ENV, 2, use_sde=use_sde, **FAST)
