@@ -32,7 +32,8 @@ def action_log_prob(actor: Any, obs: PyTorchObs, noise: th.Tensor) -> tuple[th.T
         u_i \sim \mathcal N \Big( \mu_i, \sum_j \sigma_{ji}^2 h_j^2 + \epsilon \Big)
 
     As in SB3, all observations of a minibatch share the exploration matrix. Unlike there, nothing
-    is added inside the logarithm of the Jacobian of tanh.
+    is added inside the logarithm of the Jacobian of tanh, and u is scored itself. SB3 recovers it
+    from the rounded action, which in float32 limits it to 8.3, where its gradient ends.
 
     Args:
         actor: SB3's actor of SAC, or sb3-contrib's of TQC, with ``use_sde=True``.
@@ -48,9 +49,9 @@ def action_log_prob(actor: Any, obs: PyTorchObs, noise: th.Tensor) -> tuple[th.T
     mean, log_std, features = actor.get_action_dist_params(obs)
     latent, density = features["latent_sde"], actor.action_dist
     std = density.get_std(log_std)
-    # In the noise's type, as autocast makes the products bfloat16.
-    offset = (latent @ (std * noise.reshape(std.shape))).to(noise)
-    variance = (latent.square() @ std.square()).to(noise) + density.epsilon
+    # In the parameters' type, as autocast makes the products bfloat16.
+    offset = (latent @ (std * noise.reshape(std.shape))).to(log_std)
+    variance = (latent.square() @ std.square()).to(log_std) + density.epsilon
     normal = Normal(th.zeros_like(offset), variance.sqrt(), validate_args=False)
     unsquashed = mean + offset
     return unsquashed.tanh(), normal.log_prob(offset).sum(-1) - tanh_ladj(unsquashed)

@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_flowpolicy import CrossQFlow, SACFlow, TQCFlow
-from sb3_flowpolicy.engine import Engine, groups
+from sb3_flowpolicy.engine import Engine, groups, gsde
 from sb3_flowpolicy.engine.update import Batch
 
 N_UPDATES = 20
@@ -297,6 +297,14 @@ def test_crossq_equals_sb3_contribs(
     ours.policy.load_state_dict(stock.policy.state_dict())
     crossq_loop(stock, train_on_drawn(ours))
     assert_same(ours, stock, dtype)
+
+
+def test_gsde_computes_in_the_type_of_its_parameters() -> None:
+    """SeedBatch draws noise in float32, whatever the type of the networks."""
+    actor = make(SACFlow, "GaussPolicy", th.float64, use_sde=True).actor
+    obs, noise = th.randn(8, 3), th.randn(1, gsde.noise_dim(actor))
+    got, expected = (gsde.action_log_prob(actor, obs, one) for one in (noise, noise.double()))
+    th.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_stacked_update_with_gsde_equals_single_ones() -> None:
