@@ -46,7 +46,7 @@ class SeedBatch:
     minibatches and noise, one stacked update equals S single ones. Memory: S replay buffers
     (buffer_size x (2 obs + action + 3) x 4 bytes each), S sets of parameters with their
     optimizers' moments, and random numbers for 64 updates ahead (64 x batch_size x (8 M + 8)
-    bytes per seed).
+    bytes per seed, with gSDE 512 x (M + batch_size)).
 
     Args:
         policy: As for :class:`SACFlow`.
