@@ -75,7 +75,7 @@ def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
         # Beside each other, as most agents solve either all seeds or none.
         at = table.index.get_indexer(dims) + 0.09 * (place - (len(experiment.agents) - 1) / 2)
         style = {"color": agent.color, "label": agent.label, "markersize": 4, "linewidth": 1}
-        left.plot(at, [evidence.solved_once(*pair).sum() for pair in pairs], "o-", **style)
+        left.plot(at, [evidence.solved(*pair).sum() for pair in pairs], "o-", **style)
         steps = [interquartile_mean(evidence.steps_until_solved(*pair)) for pair in pairs]
         middle = np.array([one.value for one in steps])
         bars = np.abs(np.array([[one.low, one.high] for one in steps]).T - middle)
@@ -83,7 +83,7 @@ def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
     for label, name, shade in (_ANY, *_FAMILIES):
         seeds = experiment.seeds * table[f"{name}.before_reward.runs"]
         left.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
-    left.set(title="seeds that solve the task at their best", ylabel=f"of {experiment.seeds}")
+    left.set(title="seeds that solve the task at the end", ylabel=f"of {experiment.seeds}")
     right.set(title="steps until solved", ylim=(0.0, None))
     right.yaxis.set_major_formatter("{x:,.0f}")
     for axes in (left, right):
