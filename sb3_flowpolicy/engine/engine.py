@@ -78,7 +78,8 @@ class Engine(BoundEngine):
             return f"the update of {type(model).__name__}"
         has_gsde = type(policy.actor) is objective.gsde_actor_type and policy.actor.use_sde
         if not (has_gsde or isinstance(policy.actor, FlowActor)):
-            return f"actor of type {type(policy.actor).__name__}"
+            with_gsde = " with gSDE" if model.use_sde else ""
+            return f"actor of type {type(policy.actor).__name__}{with_gsde}"
         if model.use_sde != policy.actor.use_sde:
             return f"use_sde={model.use_sde} with an actor made with use_sde={not model.use_sde}"
         if type(policy.critic) is not objective.critic_type:

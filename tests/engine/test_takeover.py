@@ -131,6 +131,12 @@ def test_what_the_engine_cannot_do_is_left_to_sb3(policy_kwargs: dict, reason: s
         model.train(1, batch_size=BATCH_SIZE)
 
 
+def test_crossq_with_gsde_is_left_to_sb3_contrib() -> None:
+    model = make(CrossQFlow, "GaussPolicy", th.float32, use_sde=True)
+    with pytest.warns(UserWarning, match="actor of type Actor with gSDE"):
+        model.train(1, batch_size=BATCH_SIZE)
+
+
 def test_frozen_parameters_and_hooks_are_left_to_sb3() -> None:
     model = make(SACFlow, "FlowPolicy", th.float32)
     for parameter in model.actor.latent_pi.parameters():
