@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -16,7 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_flowpolicy.common.validation import integer
 from sb3_flowpolicy.diagnostics.figures import correlation_figure, samples_figure
-from sb3_flowpolicy.policies import FlowActor
+from sb3_flowpolicy.policies import DistributionPolicy, FlowActor
 from sb3_flowpolicy.policies.deterministic import critic_values
 
 DASHBOARD: dict[str, dict[str, list]] = {
@@ -82,20 +83,27 @@ class PolicyDiagnosticsCallback(BaseCallback):
         self.n_samples = integer(2)("n_samples", n_samples)
 
     def _on_training_start(self) -> None:
-        actor = getattr(self.model, "actor", None)  # on-policy algorithms have none
-        if not isinstance(actor, FlowActor):
+        self._actor: Any = getattr(self.model, "actor", None)  # on-policy algorithms have none
+        if self._has_gsde():
+            warnings.warn(
+                "PolicyDiagnosticsCallback records nothing with gSDE (use_sde=True)",
+                UserWarning,
+                stacklevel=2,
+            )
+            return
+        if not isinstance(self._actor, FlowActor):
             raise ValueError(
                 "PolicyDiagnosticsCallback needs a policy of sb3_flowpolicy, off-policy, "
                 f"got {type(self.model.policy).__name__}"
             )
-        self._actor = actor
         for output in self.logger.output_formats:
             if isinstance(output, TensorBoardOutputFormat):
                 output.writer.add_custom_scalars(DASHBOARD)
 
     def _on_step(self) -> bool:
         buffer = self.model.replay_buffer
-        if self.num_timesteps <= self.model.learning_starts or buffer is None:
+        is_early = self.num_timesteps <= self.model.learning_starts
+        if is_early or buffer is None or self._has_gsde():
             return True
         draw = self.image_freq > 0 and self._due(self.image_freq)
         if draw or self._due(self.log_freq):
@@ -103,6 +111,11 @@ class PolicyDiagnosticsCallback(BaseCallback):
                 data = buffer.sample(self.n_states, env=self.model.get_vec_normalize_env())
                 self._measure(data.observations, data.actions, draw)
         return True
+
+    def _has_gsde(self) -> bool:
+        """Whether the policy, with gSDE, has SB3's actor."""
+        is_ours = isinstance(self.model.policy, DistributionPolicy)
+        return is_ours and not isinstance(self._actor, FlowActor)
 
     def _due(self, freq: int) -> bool:
         """Whether the last step, of any number of environments, crossed a multiple of ``freq``."""

@@ -65,7 +65,7 @@ class DistributionPolicy(DensityPolicy):
         if self._uses_sde and self.distribution != "gaussian":
             raise ValueError(
                 "use_sde must be False unless distribution is 'gaussian', because gSDE replaces "
-                f"the density, got use_sde=True with {self.distribution!r}"
+                f"the density, got use_sde=True with {self.distribution!r}: use GaussPolicy"
             )
         self.deterministic_samples = integer(2)("deterministic_samples", deterministic_samples)
         self.deterministic_mode = deterministic_mode

@@ -20,6 +20,7 @@ from sb3_flowpolicy.checkpoint.state import Run
 from sb3_flowpolicy.common.validation import number
 from sb3_flowpolicy.common.vec_env import info_of
 from sb3_flowpolicy.engine import LOSSES, Engine, EngineRuntime
+from sb3_flowpolicy.engine.groups import seeds_at_once
 from sb3_flowpolicy.guard.training_guard import TrainingGuard
 from sb3_flowpolicy.seeds.experience import SeedExperience
 from sb3_flowpolicy.seeds.setup import EnvFactory, check_seeds, check_stackable, make_env, refuse
@@ -227,7 +228,10 @@ class SeedBatch:
         if any(_shared_settings(model) != _shared_settings(first) for model in self.models):
             raise ValueError("agents must all have the same settings, got different ones")
         planned = first._planned_updates(first._total_timesteps)
-        self._runtime.plan(first._n_updates, planned)
+        # Agents with large networks are updated in groups, by as many calls.
+        count = len(self.models)
+        n_groups = count // seeds_at_once(first.critic, count, first.batch_size)
+        self._runtime.plan(first._n_updates * n_groups, planned * n_groups)
         self._guard.restart(self._checkpoints.path)
         self._experience.fit()
 

@@ -105,6 +105,14 @@ def test_bad_arguments(argument: dict[str, int], message: str) -> None:
         PolicyDiagnosticsCallback(**argument)
 
 
+def test_nothing_is_recorded_with_gsde() -> None:
+    """The settings of rl_zoo3 name the callback for every policy."""
+    model = SACFlow("GaussPolicy", "Pendulum-v1", use_sde=True, **FAST)
+    with pytest.warns(UserWarning, match="records nothing with gSDE"):
+        model.learn(60, callback=PolicyDiagnosticsCallback(log_freq=10, image_freq=10))
+    assert not [key for key in model.logger.name_to_value if key.startswith(("policy/", "value/"))]
+
+
 def test_stock_policies_are_refused() -> None:
     model = SAC("MlpPolicy", "Pendulum-v1", **FAST)
     with pytest.raises(

@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 import flowpolicy_envs  # noqa: F401, registers the environments
 from sb3_flowpolicy import CrossQFlow, SACFlow, SeedBatch, TQCFlow
 from sb3_flowpolicy.algorithms.demonstrations import record_demonstrations
-from sb3_flowpolicy.engine import Engine
+from sb3_flowpolicy.engine import Engine, EngineRuntime
 from sb3_flowpolicy.seeds.experience import SeedNoise
 from tests.reach import make_reach
 
@@ -312,6 +312,18 @@ def test_learns_what_a_single_agent_learns() -> None:
     for model in batch.models:
         action, _ = model.predict(np.zeros(2, dtype=np.float32), deterministic=True)
         assert action.min() > 0.7
+
+
+@pytest.mark.parametrize(("units", "n_calls"), [(16, 1), (64, 2)])
+def test_whether_to_compile_depends_on_the_calls_of_the_update(
+    units: int, n_calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Agents with large networks are updated in groups."""
+    plans: list[float] = []
+    monkeypatch.setattr(EngineRuntime, "plan", lambda _, done, updates: plans.append(updates))
+    settings = {**FAST, "batch_size": 256, "policy_kwargs": {"net_arch": [units]}}
+    SeedBatch("GaussPolicy", ENV, 10, **settings).learn(35)
+    assert plans[-1] == 5 * n_calls  # after those of the agents
 
 
 @pytest.mark.parametrize(("sde_sample_freq", "steps_alike"), [(-1, 6), (4, 4)])
