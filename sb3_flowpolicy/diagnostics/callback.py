@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch as th
@@ -83,15 +83,16 @@ class PolicyDiagnosticsCallback(BaseCallback):
         self.n_samples = integer(2)("n_samples", n_samples)
 
     def _on_training_start(self) -> None:
-        self._actor: Any = getattr(self.model, "actor", None)  # on-policy algorithms have none
-        if self._has_gsde():
+        actor = getattr(self.model, "actor", None)  # on-policy algorithms have none
+        self._actor = actor if isinstance(actor, FlowActor) else None
+        if self._actor is None and isinstance(self.model.policy, DistributionPolicy):
             warnings.warn(
                 "PolicyDiagnosticsCallback records nothing with gSDE (use_sde=True)",
                 UserWarning,
                 stacklevel=2,
             )
             return
-        if not isinstance(self._actor, FlowActor):
+        if self._actor is None:
             raise ValueError(
                 "PolicyDiagnosticsCallback needs a policy of sb3_flowpolicy, off-policy, "
                 f"got {type(self.model.policy).__name__}"
@@ -103,26 +104,23 @@ class PolicyDiagnosticsCallback(BaseCallback):
     def _on_step(self) -> bool:
         buffer = self.model.replay_buffer
         is_early = self.num_timesteps <= self.model.learning_starts
-        if is_early or buffer is None or self._has_gsde():
+        if is_early or buffer is None or self._actor is None:
             return True
         draw = self.image_freq > 0 and self._due(self.image_freq)
         if draw or self._due(self.log_freq):
             with self._own_random_numbers(), th.no_grad():
                 data = buffer.sample(self.n_states, env=self.model.get_vec_normalize_env())
-                self._measure(data.observations, data.actions, draw)
+                self._measure(self._actor, data.observations, data.actions, draw)
         return True
-
-    def _has_gsde(self) -> bool:
-        """Whether the policy, with gSDE, has SB3's actor."""
-        is_ours = isinstance(self.model.policy, DistributionPolicy)
-        return is_ours and not isinstance(self._actor, FlowActor)
 
     def _due(self, freq: int) -> bool:
         """Whether the last step, of any number of environments, crossed a multiple of ``freq``."""
         return self.num_timesteps % freq < self.training_env.num_envs
 
-    def _measure(self, obs: PyTorchObs, buffer_actions: th.Tensor, draw: bool) -> None:
-        actor, critic = self._actor, cast("ContinuousCritic", self.model.policy.critic)
+    def _measure(
+        self, actor: FlowActor, obs: PyTorchObs, buffer_actions: th.Tensor, draw: bool
+    ) -> None:
+        critic = cast("ContinuousCritic", self.model.policy.critic)
         was_training = self.model.policy.training
         self.model.policy.set_training_mode(False)
         context = actor.context(obs)
