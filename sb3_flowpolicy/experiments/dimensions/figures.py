@@ -62,35 +62,37 @@ def read_results(results: Path) -> Evidence:
 
 
 def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
-    """Draw how many seeds solve the task, and after how many steps, by number of dimensions.
+    """Draw the seeds that find and that solve the task, and their steps, by number of dimensions.
 
     Broken lines are the predicted numbers of seeds that find the goal by noise alone.
     """
     experiment = evidence.experiment
-    figure = new_figure(9.0, 4.2)
-    left, right = figure.subplots(1, 2)
+    figure = new_figure(12.0, 4.2)
+    found, solved, until = figure.subplots(1, 3)
     for place, agent in enumerate(experiment.agents):
         dims = [d for d in table.index if evidence.columns(f"{d}-dimensions", agent.name)]
         pairs = [(f"{d}-dimensions", agent.name) for d in dims]
         # Beside each other, as most agents solve either all seeds or none.
         at = table.index.get_indexer(dims) + 0.09 * (place - (len(experiment.agents) - 1) / 2)
         style = {"color": agent.color, "label": agent.label, "markersize": 4, "linewidth": 1}
-        left.plot(at, [evidence.solved(*pair).sum() for pair in pairs], "o-", **style)
+        found.plot(at, [evidence.succeeded(*pair).sum() for pair in pairs], "o-", **style)
+        solved.plot(at, [evidence.solved(*pair).sum() for pair in pairs], "o-", **style)
         steps = [interquartile_mean(evidence.steps_until_solved(*pair)) for pair in pairs]
         middle = np.array([one.value for one in steps])
         bars = np.abs(np.array([[one.low, one.high] for one in steps]).T - middle)
-        right.errorbar(at, middle, bars, fmt="o-", **style, elinewidth=0.8)
+        until.errorbar(at, middle, bars, fmt="o-", **style, elinewidth=0.8)
     for label, name, shade in (_ANY, *_FAMILIES):
         seeds = experiment.seeds * table[f"{name}.before_reward.runs"]
-        left.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
-    left.set(title="seeds that solve the task at the end", ylabel=f"of {experiment.seeds}")
-    right.set(title="steps until solved", ylim=(0.0, None))
-    right.yaxis.set_major_formatter("{x:,.0f}")
-    for axes in (left, right):
+        found.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
+    found.set(title="seeds that find the goal while training", ylabel=f"of {experiment.seeds}")
+    solved.set(title="seeds that solve the task at the end", ylabel=f"of {experiment.seeds}")
+    until.set(title="steps until solved", ylim=(0.0, None))
+    until.yaxis.set_major_formatter("{x:,.0f}")
+    for axes in (found, solved, until):
         axes.set_xticks(range(len(table)), table.index.astype(str))
         axes.set_xlabel("coupled dimensions")
         axes.grid(color="#eeeeee")
     figure.legend(
-        *left.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False
+        *found.get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False
     )
     return figure
