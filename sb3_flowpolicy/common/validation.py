@@ -185,14 +185,17 @@ def check_policy(policy: Any, base: type, names: Iterable[str]) -> None:
     """Check that a policy is one of an algorithm's names, or a class of its kind.
 
     Example:
-        >>> from stable_baselines3.sac.policies import SACPolicy
-        >>> from sb3_flowpolicy import FlowTQCPolicy
-        >>> check_policy(FlowTQCPolicy, SACPolicy, ["FlowPolicy"])
+        >>> from sb3_contrib.tqc.policies import TQCPolicy
+        >>> from sb3_flowpolicy import FlowPolicy
+        >>> check_policy(FlowPolicy, TQCPolicy, ["FlowPolicy"])  # doctest: +NORMALIZE_WHITESPACE
         Traceback (most recent call last):
         ...
-        ValueError: policy must be one of ['FlowPolicy'] or subclass SACPolicy, got FlowTQCPolicy
+        ValueError: policy must be one of ['FlowPolicy'] or subclass TQCPolicy, got the class
+        FlowPolicy of another algorithm; pass the name 'FlowPolicy'
     """
     known = list(names)
     if not (issubclass(policy, base) if isinstance(policy, type) else policy in known):
-        name = getattr(policy, "__name__", repr(policy))
-        raise ValueError(f"policy must be one of {known} or subclass {base.__name__}, got {name}")
+        got = getattr(policy, "__name__", repr(policy))
+        if got in known:
+            got = f"the class {got} of another algorithm; pass the name {got!r}"
+        raise ValueError(f"policy must be one of {known} or subclass {base.__name__}, got {got}")
