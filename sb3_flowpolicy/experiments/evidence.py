@@ -87,9 +87,7 @@ class Evidence:
     def complete(self) -> bool:
         """Whether all agents have finished on all settings."""
         there = {(item["setting"], item["agent"]) for item in self.items.values()}
-        wanted = {
-            (s.name, a.name) for s in self.experiment.settings for a in self.experiment.agents
-        }
+        wanted = {(setting.name, agent.name) for setting, agent in self.experiment.pairs}
         return wanted <= there and all(self.done.values())
 
     @cached_property
@@ -106,8 +104,7 @@ class Evidence:
         """All settings and agents of which there is anything."""
         return [
             (setting, agent)
-            for setting in self.experiment.settings
-            for agent in self.experiment.agents
+            for setting, agent in self.experiment.pairs
             if (setting.name, agent.name) in self._logs
         ]
 

@@ -48,19 +48,21 @@ AGENTS = (GAUSS, LOW_RANK, FLOW)
 
 @dataclass(frozen=True)
 class Setting:
-    """An environment with hyperparameters; every agent of the experiment is trained on it.
+    """An environment with hyperparameters, on which the experiment's agents are trained.
 
     Attributes:
         name: Name in commands and file names.
         env_id: Registered environment.
         env_kwargs: Arguments in which the environment differs from its registration.
         overrides: What differs from the environment's block of ``zoo_hyperparams``, for all agents.
+        without: Names of agents that are not trained on it.
     """
 
     name: str
     env_id: str
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    without: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -119,3 +121,13 @@ class Experiment:
     measures: tuple[str, ...] = ()
     pictures_at: tuple[float, ...] = ()
     notes: str = ""
+
+    @property
+    def pairs(self) -> list[tuple[Setting, Agent]]:
+        """Each setting with each agent that is trained on it."""
+        return [
+            (setting, agent)
+            for setting in self.settings
+            for agent in self.agents
+            if agent.name not in setting.without
+        ]

@@ -70,6 +70,8 @@ _WIDENED_TUNNELS = tuple(
         f"{dims}-dimensions",
         "TunnelDiagonal-v0",
         env_kwargs={"total_dims": dims, "coupled_dims": dims, "width": width},
+        # See the notes.
+        without=("spline",) if dims > 12 else (),
     )
     for dims, width in WIDTHS.items()
 )
@@ -87,14 +89,19 @@ EXPLORATION_CLAIMS = (
         settings=_WIDENED_TUNNELS,
         agents=_WIDENED,
         checks=tuple(
-            checks.solved(f"{dims}-dimensions", agent, 0.9) for dims in WIDTHS for agent in _WIDENED
+            checks.solved(setting.name, agent, 0.9)
+            for setting in _WIDENED_TUNNELS
+            for agent in _WIDENED
+            if agent.name not in setting.without
         ),
         notes="Everything but the width is as in diagonal-dimensions, where it is constant and no "
         "agent solves four or more dimensions. `python -m sb3_flowpolicy.experiments.dimensions` "
         "predicts the entropy that each family can hold if 90 % of its steps survive: correlated "
         "noise holds 2.7 nats more than independent noise with two dimensions, 1.1 with four, 0.5 "
-        "with eight and 0.2 with 32. gSDE updates as in exploration-benchmark. There is no claim "
-        "to reproduce: each line states whether that agent solves the task.",
+        "with eight and 0.2 with 32. The spline was not run with 16 and 32: no noise is predicted "
+        "to find the goal there, and these runs would cost 2.5 of the 12 core hours. gSDE updates "
+        "as in exploration-benchmark. There is no claim to reproduce: each line states whether "
+        "that agent solves the task.",
     ),
     Experiment(
         name="diagonal-causes",

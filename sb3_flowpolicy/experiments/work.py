@@ -147,7 +147,7 @@ def make_plan(
     eval_every = max(1, min(experiment.eval_every, steps // 6))
     between_checkpoints = min(steps / CHECKPOINTS, MOST_STEPS_BETWEEN_CHECKPOINTS)
     items = []
-    for setting, agent, group in itertools.product(experiment.settings, experiment.agents, groups):
+    for (setting, agent), group in itertools.product(experiment.pairs, groups):
         part = f"-seeds-{group[0]}-{group[-1]}" if len(groups) > 1 else ""
         hyperparameters = load_hyperparameters(agent.algo, setting.env_id)
         hyperparameters.pop("n_timesteps", None)

@@ -150,6 +150,16 @@ def test_our_experiments_reproduce_nothing(make_up: MakeUp, tmp_path: Path) -> N
     assert theirs.verdict_in_words == theirs.verdict
 
 
+def test_results_are_complete_without_agents_that_a_setting_leaves_out(
+    make_up: MakeUp, tmp_path: Path
+) -> None:
+    agents: dict[str, list[str]] = {}
+    for item in make_up("diagonal-widened", seeds=1).items:
+        agents.setdefault(item.setting, []).append(item.agent)
+    assert set(agents["12-dimensions"]) - set(agents["16-dimensions"]) == {"spline"}
+    assert evidence("diagonal-widened", tmp_path).complete
+
+
 def test_docs_hold_tables_figures_and_data(make_up: MakeUp, tmp_path: Path) -> None:
     make_up("circle-fixed-entropy", seeds=3)
     docs = tmp_path / "docs"
