@@ -41,7 +41,7 @@ _UNITS_16 = {
 FLOW_WIDE = Agent("flow-wide", "NF, 16 units", "sac_flow", "#08519c", _UNITS_16)
 _WIDE_PINK = {**_UNITS_16, **_PINK}
 FLOW_WIDE_PINK = Agent(
-    "flow-wide-pink", "NF, 16 units, pink noise", "sac_flow", "#6baed6", _WIDE_PINK
+    "flow-wide-pink", "NF, 16 units, pink noise", "sac_flow", "#e7298a", _WIDE_PINK
 )
 FLOW_PINK = Agent("flow-pink", "NF, pink noise", "sac_flow", "#56b4e9", _PINK)
 SPLINE = Agent("spline", "spline", "sac_flow", "#6a3d9a", _density("spline"))

@@ -143,6 +143,7 @@ def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch, caps
     )
     if results:
         make_up("diagonal-widened")
+        make_up("diagonal-causes")
     command = ["--figure", str(tmp_path / "p.png"), "--results", str(tmp_path)]
     if results:
         main(command)
@@ -150,7 +151,10 @@ def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch, caps
     else:
         with pytest.raises(SystemExit):
             main(command)
-        assert "--results: no results of diagonal-widened" in capsys.readouterr().err
+        assert (
+            "--results: no results of diagonal-widened or diagonal-causes"
+            in capsys.readouterr().err
+        )
 
 
 def test_the_command_writes_what_it_prints(tmp_path, capsys, monkeypatch):

@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--survival", type=float, default=0.9, help=survival)
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results there")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="also draw them as PNG")
-    results = "folder with the results of experiment diagonal-widened, to draw these instead"
+    results = "folder with results of diagonal-widened and diagonal-causes, to draw these instead"
     parser.add_argument("--results", type=Path, metavar="FOLDER", help=results)
     args = parser.parse_args(arguments)
     if not 0.0 < args.survival < 1.0:
@@ -37,13 +37,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error("--results needs --figure")
     for name in ("json", "figure"):
         check_folder_of(parser, f"--{name}", getattr(args, name))
-    evidence = None
+    measured = None
     if args.figure is not None:
         # Slow imports that the table does not need.
         from sb3_flowpolicy.experiments.dimensions import figures
 
         try:
-            evidence = None if args.results is None else figures.read_results(args.results)
+            measured = None if args.results is None else figures.read_results(args.results)
         except ValueError as error:
             parser.error(f"--results: {error}")
     rows = [
@@ -71,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.figure is not None:
         figure = (
             figures.prediction_figure(table, args.survival)
-            if evidence is None
-            else figures.results_figure(table, evidence)
+            if measured is None
+            else figures.results_figure(table, measured)
         )
         figure.savefig(args.figure, dpi=110)
 

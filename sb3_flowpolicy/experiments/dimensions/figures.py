@@ -17,6 +17,7 @@ from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_EXPERIMENTS = ("diagonal-widened", "diagonal-causes")
 _ANY = ("any density", "any", "#555555")
 _FAMILIES = (
     ("LR, full covariance", "correlated", LOW_RANK.color),
@@ -52,28 +53,28 @@ def prediction_figure(table: pd.DataFrame, survival: float) -> Figure:
     return figure
 
 
-def read_results(results: Path) -> Evidence:
-    """Read the experiment's results; raise ``ValueError`` if the folder has none."""
-    experiment = EXPERIMENTS["diagonal-widened"]
-    evidence = Evidence(experiment, results / experiment.name)
-    if not evidence.measured:
-        raise ValueError(f"no results of {experiment.name} in {results}")
-    return evidence
+def read_results(results: Path) -> list[Evidence]:
+    """Read both experiments' results; raise ``ValueError`` if the folder has none."""
+    both = [Evidence(EXPERIMENTS[name], results / name) for name in _EXPERIMENTS]
+    measured = [evidence for evidence in both if evidence.measured]
+    if not measured:
+        raise ValueError(f"no results of {' or '.join(_EXPERIMENTS)} in {results}")
+    return measured
 
 
-def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
+def results_figure(table: pd.DataFrame, measured: list[Evidence]) -> Figure:
     """Draw the seeds that find and that solve the task, and their steps, by number of dimensions.
 
     Broken lines are the predicted numbers of seeds that find the goal by noise alone.
     """
-    experiment = evidence.experiment
-    figure = new_figure(12.0, 4.2)
+    figure = new_figure(12.0, 4.6)
     found, solved, until = figure.subplots(1, 3)
-    for place, agent in enumerate(experiment.agents):
+    curves = [(evidence, agent) for evidence in measured for agent in evidence.experiment.agents]
+    for place, (evidence, agent) in enumerate(curves):
         dims = [d for d in table.index if evidence.columns(f"{d}-dimensions", agent.name)]
         pairs = [(f"{d}-dimensions", agent.name) for d in dims]
         # Beside each other, as most agents solve either all seeds or none.
-        at = table.index.get_indexer(dims) + 0.09 * (place - (len(experiment.agents) - 1) / 2)
+        at = table.index.get_indexer(dims) + 0.06 * (place - (len(curves) - 1) / 2)
         style = {"color": agent.color, "label": agent.label, "markersize": 4, "linewidth": 1}
         found.plot(at, [evidence.succeeded(*pair).sum() for pair in pairs], "o-", **style)
         solved.plot(at, [evidence.solved(*pair).sum() for pair in pairs], "o-", **style)
@@ -81,11 +82,12 @@ def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
         middle = np.array([one.value for one in steps])
         bars = np.abs(np.array([[one.low, one.high] for one in steps]).T - middle)
         until.errorbar(at, middle, bars, fmt="o-", **style, elinewidth=0.8)
+    n_seeds = measured[0].experiment.seeds
     for label, name, shade in (_ANY, *_FAMILIES):
-        seeds = experiment.seeds * table[f"{name}.before_reward.runs"]
+        seeds = n_seeds * table[f"{name}.before_reward.runs"]
         found.plot(range(len(table)), seeds, "--", color=shade, label=f"predicted: {label}")
-    found.set(title="seeds that find the goal while training", ylabel=f"of {experiment.seeds}")
-    solved.set(title="seeds that solve the task at the end", ylabel=f"of {experiment.seeds}")
+    found.set(title="seeds that find the goal while training", ylabel=f"of {n_seeds}")
+    solved.set(title="seeds that solve the task at the end", ylabel=f"of {n_seeds}")
     until.set(title="steps until solved", ylim=(0.0, None))
     until.yaxis.set_major_formatter("{x:,.0f}")
     for axes in (found, solved, until):
@@ -93,6 +95,6 @@ def results_figure(table: pd.DataFrame, evidence: Evidence) -> Figure:
         axes.set_xlabel("coupled dimensions")
         axes.grid(color="#eeeeee")
     figure.legend(
-        *found.get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False
+        *found.get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False
     )
     return figure
