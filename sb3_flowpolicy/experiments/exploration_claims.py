@@ -24,6 +24,7 @@ def _density(name: str) -> dict[str, Any]:
 
 
 GAUSS_PINK = Agent("gauss-pink", "Gauss, pink noise", "sac_gauss", "#8c2d04", _PINK)
+LOW_RANK_PINK = Agent("lowrank-pink", "LR, pink noise", "sac_lowrank", "#a6d854", _PINK)
 # SB3 draws gSDE's noise once per rollout: with train_freq=1 it would be white.
 GSDE = Agent(
     "gsde", "gSDE", "sac_gauss", "#999999", {"use_sde": True, "train_freq": 8, "gradient_steps": 8}
@@ -76,7 +77,7 @@ _WIDENED_TUNNELS = tuple(
     for dims, width in WIDTHS.items()
 )
 _SIX_AND_EIGHT = tuple(one for one in _WIDENED_TUNNELS if one.env_kwargs["total_dims"] in (6, 8))
-_SEPARATED = (GAUSS_PINK, FLOW_WIDE, FLOW_WIDE_PINK)
+_SEPARATED = (GAUSS_PINK, LOW_RANK_PINK, FLOW_WIDE, FLOW_WIDE_PINK)
 
 EXPLORATION_CLAIMS = (
     Experiment(
@@ -116,8 +117,8 @@ EXPLORATION_CLAIMS = (
         ),
         notes="Everything else is as in diagonal-widened. As in the thesis, networks of flows have "
         "4 units there and those of Gaussians 16. Here the flow has 16 as well, with white and "
-        "with pink noise; pink noise with Gauss shows what it does alone. There is no claim to "
-        "reproduce: each line states whether that agent solves the task.",
+        "with pink noise; Gauss and LR show what pink noise does for other densities. There is no "
+        "claim to reproduce: each line states whether that agent solves the task.",
     ),
     Experiment(
         name="exploration-benchmark",
