@@ -98,7 +98,7 @@ def test_names_of_policies(algorithm: Any) -> None:
         ({"policy": "stock", "action_noise_color": 1.0}, "one of sb3_flowpolicy's"),
         ({"ent_coef": -1.0}, "ent_coef must be at least 0, got -1.0"),
         ({"learning_rate": -1.0}, "learning_rate must be a function or at least 0, got -1.0"),
-        ({"policy": FlowPolicy}, "policy must be one of .* got FlowPolicy"),
+        ({"policy": FlowPolicy}, "one of .* got the class FlowPolicy of another algorithm; pass"),
         ({"policy": FlowActorCriticPolicy}, "policy must be one of .* got FlowActorCriticPolicy"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics must be an integer of at least 1, got 0"),
     ],
