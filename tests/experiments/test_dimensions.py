@@ -152,7 +152,7 @@ def test_the_command_draws_results(results, make_up, tmp_path, monkeypatch, caps
         with pytest.raises(SystemExit):
             main(command)
         assert (
-            "--results: no results of diagonal-widened or diagonal-causes"
+            "--results: no complete results of diagonal-widened or diagonal-causes"
             in capsys.readouterr().err
         )
 

@@ -21,7 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m sb3_flowpolicy.experiments.dimensions",
         description="Diagonal tunnels whose random first steps survive equally often: predict the "
         "highest entropy of independent and of correlated noise, and how often noise finds the "
-        "goal. The figure shows the entropy, or with --results how many seeds solve the task.",
+        "goal. The figure shows the entropy, or with --results how many seeds find the goal and "
+        "solve the task.",
         formatter_class=HelpFormatter,
     )
     survival = "probability with which a step of the policy survives"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,7 @@ from sb3_flowpolicy.experiments.manifest import EXPERIMENTS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_EXPERIMENTS = ("diagonal-widened", "diagonal-causes")
+_SOURCES = ("diagonal-widened", "diagonal-causes")
 _ANY = ("any density", "any", "#555555")
 _FAMILIES = (
     ("LR, full covariance", "correlated", LOW_RANK.color),
@@ -54,12 +54,12 @@ def prediction_figure(table: pd.DataFrame, survival: float) -> Figure:
 
 
 def read_results(results: Path) -> list[Evidence]:
-    """Read both experiments' results; raise ``ValueError`` if the folder has none."""
-    both = [Evidence(EXPERIMENTS[name], results / name) for name in _EXPERIMENTS]
-    measured = [evidence for evidence in both if evidence.measured]
-    if not measured:
-        raise ValueError(f"no results of {' or '.join(_EXPERIMENTS)} in {results}")
-    return measured
+    """Read both experiments' results; raise ``ValueError`` if neither is complete."""
+    both = [Evidence(EXPERIMENTS[name], results / name) for name in _SOURCES]
+    complete = [evidence for evidence in both if evidence.complete]
+    if not complete:
+        raise ValueError(f"no complete results of {' or '.join(_SOURCES)} in {results}")
+    return complete
 
 
 def results_figure(table: pd.DataFrame, measured: list[Evidence]) -> Figure:
@@ -75,13 +75,15 @@ def results_figure(table: pd.DataFrame, measured: list[Evidence]) -> Figure:
         pairs = [(f"{d}-dimensions", agent.name) for d in dims]
         # Beside each other, as most agents solve either all seeds or none.
         at = table.index.get_indexer(dims) + 0.06 * (place - (len(curves) - 1) / 2)
-        style = {"color": agent.color, "label": agent.label, "markersize": 4, "linewidth": 1}
-        found.plot(at, [evidence.succeeded(*pair).sum() for pair in pairs], "o-", **style)
-        solved.plot(at, [evidence.solved(*pair).sum() for pair in pairs], "o-", **style)
+        marker = "s" if "action_noise_color" in agent.overrides else "o"
+        style: dict[str, Any] = {"color": agent.color, "label": agent.label, "marker": marker}
+        style |= {"markersize": 4, "linewidth": 1}
+        found.plot(at, [evidence.succeeded(*pair).sum() for pair in pairs], **style)
+        solved.plot(at, [evidence.solved(*pair).sum() for pair in pairs], **style)
         steps = [interquartile_mean(evidence.steps_until_solved(*pair)) for pair in pairs]
         middle = np.array([one.value for one in steps])
         bars = np.abs(np.array([[one.low, one.high] for one in steps]).T - middle)
-        until.errorbar(at, middle, bars, fmt="o-", **style, elinewidth=0.8)
+        until.errorbar(at, middle, bars, **style, elinewidth=0.8)
     n_seeds = measured[0].experiment.seeds
     for label, name, shade in (_ANY, *_FAMILIES):
         seeds = n_seeds * table[f"{name}.before_reward.runs"]
