@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,6 +63,10 @@ class Setting:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     overrides: Mapping[str, Any] = field(default_factory=dict)
     without: tuple[str, ...] = ()
+
+    def trained(self, agents: Iterable[Agent]) -> list[Agent]:
+        """Return those of the agents that are trained on it."""
+        return [agent for agent in agents if agent.name not in self.without]
 
 
 @dataclass(frozen=True)
@@ -125,9 +129,4 @@ class Experiment:
     @property
     def pairs(self) -> list[tuple[Setting, Agent]]:
         """Each setting with each agent that is trained on it."""
-        return [
-            (setting, agent)
-            for setting in self.settings
-            for agent in self.agents
-            if agent.name not in setting.without
-        ]
+        return [(one, agent) for one in self.settings for agent in one.trained(self.agents)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ from sb3_flowpolicy.experiments.experiment import (
     GAUSS,
     LOW_RANK,
     Agent,
+    Check,
     Experiment,
     Setting,
 )
@@ -80,6 +82,14 @@ _WIDENED_TUNNELS = tuple(
 _SIX_AND_EIGHT = tuple(one for one in _WIDENED_TUNNELS if one.env_kwargs["total_dims"] in (6, 8))
 _CAUSES = (GAUSS_PINK, LOW_RANK_PINK, FLOW_16, FLOW_16_PINK)
 
+
+def _each_solves(settings: Sequence[Setting], agents: Sequence[Agent]) -> tuple[Check, ...]:
+    """Return a check for each setting with each agent that is trained on it."""
+    return tuple(
+        checks.solved(one.name, agent, 0.9) for one in settings for agent in one.trained(agents)
+    )
+
+
 EXPLORATION_CLAIMS = (
     Experiment(
         name="diagonal-widened",
@@ -90,12 +100,7 @@ EXPLORATION_CLAIMS = (
         "survive, so that the densities are compared, not the chance of a first step.",
         settings=_WIDENED_TUNNELS,
         agents=_WIDENED,
-        checks=tuple(
-            checks.solved(setting.name, agent, 0.9)
-            for setting in _WIDENED_TUNNELS
-            for agent in _WIDENED
-            if agent.name not in setting.without
-        ),
+        checks=_each_solves(_WIDENED_TUNNELS, _WIDENED),
         notes="Everything but the width is as in diagonal-dimensions, where it is constant and no "
         "agent solves four or more dimensions. `python -m sb3_flowpolicy.experiments.dimensions` "
         "predicts the entropy that each family can hold if 90 % of its steps survive: correlated "
@@ -113,9 +118,7 @@ EXPLORATION_CLAIMS = (
         thesis="Not in the thesis, which has two dimensions and no colored noise.",
         settings=_SIX_AND_EIGHT,
         agents=_CAUSES,
-        checks=tuple(
-            checks.solved(one.name, agent, 0.9) for one in _SIX_AND_EIGHT for agent in _CAUSES
-        ),
+        checks=_each_solves(_SIX_AND_EIGHT, _CAUSES),
         notes="Everything else is as in diagonal-widened. As in the thesis, actors and couplings "
         "of flows have 4 units there and actors of Gaussians 16. Here those of the flow have 16 as "
         "well, with white and with pink noise; Gauss and LR show what pink noise does for other "
